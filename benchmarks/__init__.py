@@ -1,11 +1,12 @@
-"""Speeds and errors of v3dg, and worlds to measure them on; run from a checkout, never
-installed."""
+"""Benchmarks of the speed and errors of v3dg, and generators of worlds for them. The
+package runs from a checkout and is never installed."""
 
 import sys
 from pathlib import Path
 
-# `python -m` puts the checkout first, where v3dg/ would hide the installed package.
-# Unless a compiled module lies beside the sources, the checkout is moved to the end.
+# `python -m` puts the checkout first on the path, where its v3dg/ would hide the
+# installed package. So the checkout is moved to the end, unless a compiled module lies
+# beside the sources.
 _ROOT = Path(__file__).resolve().parent.parent
 if not any((_ROOT / "v3dg").glob("_core.*.so")):
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != _ROOT] + [

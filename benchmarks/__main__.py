@@ -1,4 +1,4 @@
-"""`python -m benchmarks COMMAND`, from the root of a checkout."""
+"""The command `python -m benchmarks COMMAND`, which runs in the root of a checkout."""
 
 import sys
 

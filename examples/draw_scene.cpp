@@ -1,6 +1,6 @@
-// Draws a small scene with the core alone, without Python: two instances of a bundle of one level,
-// selected and drawn in one call, to a .ppm. Build it with `cmake --build build/cpu --target
-// draw_scene`.
+// Draws a small scene with the C++ core, without Python: two instances of a bundle with one level.
+// One call selects and draws them, and the picture is written as a .ppm file. Build the example
+// with `cmake --build build/cpu --target draw_scene`.
 
 #include <cmath>
 #include <cstdio>
@@ -15,7 +15,7 @@ using namespace v3dg;
 constexpr size_t kGaussians = 2000, kClusterSize = 250, kClusters = kGaussians / kClusterSize;
 constexpr int kWidth = 320, kHeight = 240;
 
-// Gaussians on a spiral around a unit sphere, whose clusters go from pole to pole.
+// Gaussians on a spiral around a unit sphere, in clusters that are ordered from pole to pole.
 struct Globe {
     std::vector<float> means, quats, scales, opacities, sh;
 

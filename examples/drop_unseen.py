@@ -1,8 +1,10 @@
-"""Drop the gaussians of a captured scene that nobody sees from where people are, before
-its levels are built.
+"""Drop the gaussians of a captured scene that cannot be seen from where people are,
+before its levels are built.
 
-pip install '.[torch]' && python examples/drop_unseen.py scene.ply transforms.json
-scene_seen.ply --keep 0.8
+The example needs torch:
+
+    pip install '.[torch]'
+    python examples/drop_unseen.py scene.ply transforms.json scene_seen.ply --keep 0.8
 """
 
 from __future__ import annotations
@@ -21,30 +23,33 @@ import v3dg
 
 @dataclass
 class Config:
-    """Rank gaussians by how much cameras see of them, and write those that are seen
-    most."""
+    """Rank gaussians by how much of them cameras see, and write the most visible
+    ones."""
 
     asset: tyro.conf.Positional[Path]
-    """File to read, of any format that v3dg reads."""
+    """Asset to read, in any format that v3dg reads."""
     cameras: tyro.conf.Positional[Path]
-    """Where people are: what v3dg.read_cameras reads, such as the cameras of the
-    capture."""
+    """Cameras where people are, in any format that v3dg.read_cameras reads, such as the
+    cameras of the capture."""
     output: tyro.conf.Positional[Path]
-    """File to write, of any format that v3dg writes."""
+    """Asset to write, in any format that v3dg writes."""
     keep: float = 1.0
-    """Share that is kept of the gaussians that are seen at all."""
+    """Fraction of the visible gaussians to keep."""
     turns: int = 1
-    """Directions that are looked into from each camera, spread evenly around its
-    upright axis."""
+    """Number of directions in which each camera looks, evenly spaced around its
+    vertical axis."""
     width: int = 512
-    """px of the pictures."""
+    """Width of the pictures in px."""
     device: str = "cpu"
 
 
 def main(config: Config) -> float:
-    """Write what is kept, and return its share of the asset."""
+    """Write the gaussians to keep; return their fraction of the asset."""
     if not (0 < config.keep <= 1 and config.turns >= 1 and config.width >= 1):
-        raise SystemExit("expected --keep above 0 and at most 1, --turns and --width at least 1")
+        raise SystemExit(
+            "--keep, --turns, --width: expected a --keep above 0 and at most 1, and --turns and "
+            "--width of at least 1"
+        )
     asset = v3dg.read_asset(config.asset)
     weights = np.zeros(len(asset))
     for camera in views(config):
@@ -53,15 +58,13 @@ def main(config: Config) -> float:
     num_seen = int((weights > 0).sum())
     kept = asset.subset(np.sort(order[len(asset) - math.ceil(config.keep * num_seen) :]))
     v3dg.write_asset(config.output, kept)
-    print(
-        f"{config.output}: {len(kept):,} of {len(asset):,} gaussians, of which {num_seen:,} are "
-        "seen"
-    )
+    print(f"{config.output}: {len(kept):,} of {len(asset):,} gaussians; cameras see {num_seen:,}")
     return len(kept) / len(asset)
 
 
 def views(config: Config) -> Iterator[v3dg.Camera]:
-    """The cameras, turned, with pictures of the wanted width."""
+    """Yield the cameras, rotated in all directions, with pictures of the requested
+    width."""
     for camera in v3dg.read_cameras(config.cameras).values():
         scale = config.width / camera.width
         K = camera.K * np.array([[scale], [scale], [1.0]])
@@ -74,10 +77,11 @@ def views(config: Config) -> Iterator[v3dg.Camera]:
 
 
 def weights_in(asset: v3dg.Gaussians, camera: v3dg.Camera, device: str) -> npt.NDArray[np.float64]:
-    """(N,) blend weight of each gaussian, summed over the pixels.
+    """Return (N,) the blend weight of each gaussian, summed over the pixels.
 
-    It is the gradient of the picture's sum by the gaussian's colour, hence by its SH
-    coefficient over the constant that coefficients of degree 0 are multiplied with.
+    The weight is the derivative of the sum of all pixels by the gaussian's colour. This
+    is the gradient of its SH coefficient of degree 0, divided by the constant spherical
+    harmonic.
     """
     import torch
 

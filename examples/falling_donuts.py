@@ -1,7 +1,10 @@
-"""Let donuts fall into a pile, and film it: the scene moves and the cut is chosen anew
-in every frame.
+"""Let donuts fall into a pile, and film them. The instances move, and a new cut is
+selected in every frame.
 
-Needs the extra `video`: pip install '.[video]' && python examples/falling_donuts.py
+The example needs the extra `video`:
+
+    pip install '.[video]'
+    python examples/falling_donuts.py
 """
 
 from __future__ import annotations
@@ -19,44 +22,45 @@ from tqdm import tqdm
 
 import v3dg
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))  # for benchmarks/ of this checkout
+# So that benchmarks/ of this checkout can be imported.
+sys.path.append(str(Path(__file__).resolve().parents[1]))
 from benchmarks.worlds import donut_shower
 from benchmarks.worlds.procedural import make_donut
 from v3dg.video import write_video
 
 FPS = 30
-STEPS_PER_FRAME = 2  # of the physics: a sixtieth of a second each
+STEPS_PER_FRAME = 2  # steps of the physics, of 1/60 s each
 BACKGROUND = (0.80, 0.86, 0.90)
 
 
 @dataclass
 class Config:
-    """Let donuts fall into a pile, and film it."""
+    """Let donuts fall into a pile, and film them."""
 
     output: Path = Path("falling_donuts.mp4")
-    """Film to write, .mp4."""
+    """Film to write, an .mp4 file."""
     donuts: int = 240
-    """How many fall."""
+    """Number of donuts that fall."""
     gaussians: int = 15_000
-    """Of each kind of donut."""
+    """Number of gaussians of each kind of donut."""
     icings: int = 3
-    """Kinds of donuts, at most 4."""
+    """Number of kinds of donuts, which differ in their icing; at most 4."""
     seconds: float = 4.0
-    """Length of the film."""
+    """Length of the film in seconds."""
     size: tuple[int, int] = (1280, 720)
-    """Width and height in px, even numbers."""
+    """Width and height of the film in px, even numbers."""
     tolerance: float = v3dg.DEFAULT_TOLERANCE
-    """Screen area in px² that one gaussian of a coarser cluster may stand for."""
+    """Maximum screen area in px² for each gaussian of a coarser cluster."""
     steps: int = v3dg.BuildConfig.steps
-    """Of the fit of each level; fewer build faster."""
+    """Number of steps of the fit of each level; fewer steps build faster."""
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
 def main(config: Config) -> None:
-    """Build, drop, draw and write the film."""
+    """Build the bundles, simulate the fall, draw the frames and write the film."""
     pile = donut_shower(config.donuts, seed=config.seed, layers=12)
-    pile.positions[:, 2] += 0.3  # the first are in the air when the film begins
+    pile.positions[:, 2] += 0.3  # the lowest donuts are in the air when the film begins
     scene, order = make_scene(config, pile.positions, pile.quaternions, pile.scales)
     num_frames = round(config.seconds * FPS)
 
@@ -81,8 +85,11 @@ def main(config: Config) -> None:
 def make_scene(
     config: Config, positions: Any, quaternions: Any, scales: Any
 ) -> tuple[v3dg.Scene, np.ndarray[Any, Any]]:
-    """Donuts of several icings in turn, and which donut of the pile each instance of
-    the scene is."""
+    """Make the scene, with donuts of several kinds in turn.
+
+    Returns:
+        The scene, and for each of its instances the index of a donut in the pile.
+    """
     build = v3dg.BuildConfig(steps=config.steps)
     scene, order = v3dg.Scene(), []
     for icing in range(config.icings):
@@ -95,7 +102,7 @@ def make_scene(
 
 
 def camera_at(time: float, config: Config) -> v3dg.Camera:
-    """A camera that circles the pile a little and sinks as it grows; ``time`` is in
+    """Return a camera that slowly circles the pile and moves down; ``time`` is in
     [0,1]."""
     azimuth, elevation = 0.5 + 0.9 * time, 0.42 - 0.12 * time
     reach = 0.10 * math.sqrt(config.donuts / 12) + 0.25

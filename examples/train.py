@@ -1,10 +1,13 @@
-"""Train gaussians to pictures: gsplat's arguments, v3dg's pictures and gradients, on
-the CPU or on a GPU.
+"""Train gaussians on pictures with the arguments of gsplat's `rasterization`, on a CPU
+or a GPU. v3dg draws the pictures and computes the gradients.
 
-The pictures here are of a donut that is made for it; yours come from a camera. What is
-trained is written as an asset, to which `v3dg build` gives levels.
+The pictures of this example show a generated donut; in practice they are photographs.
+The result is written as an asset, for which `v3dg build` can build levels.
 
-Needs torch: pip install '.[torch]' && python examples/train.py
+The example needs torch:
+
+    pip install '.[torch]'
+    python examples/train.py
 """
 
 from __future__ import annotations
@@ -28,25 +31,25 @@ RATES = {"means": 4e-3, "quats": 1e-2, "scales": 2e-2, "opacities": 5e-2, "sh": 
 
 @dataclass
 class Config:
-    """Train gaussians to pictures of a donut."""
+    """Train gaussians on pictures of a donut."""
 
     output: Path = Path("trained.ply")
     """Asset to write."""
     gaussians: int = 2000
-    """How many to train."""
+    """Number of gaussians to train."""
     steps: int = 300
-    """Steps, of two pictures each."""
+    """Number of steps, each with two pictures."""
     pictures: int = 24
-    """How many pictures there are to train on."""
+    """Number of pictures to train on."""
     size: tuple[int, int] = (160, 120)
-    """Their width and height in px."""
+    """Width and height of the pictures in px."""
     device: str = "cpu"
-    """Where to train: cpu or cuda."""
+    """Device for the training: cpu or cuda."""
 
 
 def main(config: Config) -> float:
-    """Write the asset, and return how near its picture is to one that it was not
-    trained on, in dB."""
+    """Write the asset; return the PSNR in dB of its picture from a camera that was not
+    used in training."""
     cameras = v3dg.turntable(
         (0, 0, 0),
         3.5,
@@ -62,14 +65,14 @@ def main(config: Config) -> float:
     picture = v3dg.rasterize(asset, cameras[0], filter_px2=0.3).color
     likeness = psnr(np.clip(targets[0], 0, 1), np.clip(picture, 0, 1))
     print(
-        f"{config.output}: {len(asset):,} gaussians, {likeness:.1f} dB to a picture that they "
-        "never saw"
+        f"{config.output}: {len(asset):,} gaussians, {likeness:.1f} dB on a picture that was not "
+        "used in training"
     )
     return likeness
 
 
 def train(cameras: list[v3dg.Camera], pictures: list[Any], config: Config) -> v3dg.Gaussians:
-    """Gaussians that look like the pictures, one a camera."""
+    """Train gaussians on pictures, one for each camera, and return them."""
     generator = np.random.default_rng(0)
     parameters = start(config.gaussians, generator, config.device)
     groups = [{"params": [parameters[name]], "lr": rate} for name, rate in RATES.items()]
@@ -97,8 +100,8 @@ def train(cameras: list[v3dg.Camera], pictures: list[Any], config: Config) -> v3
 
 
 def start(num: int, generator: np.random.Generator, device: str) -> dict[str, torch.Tensor]:
-    """Grey gaussians all over the place, as training changes them: logs of scales,
-    logits of opacities."""
+    """Return grey gaussians at random positions, in the form that training changes:
+    logarithms of scales and logits of opacities."""
     values = {
         "means": generator.uniform(-1, 1, (num, 3)) * [1.1, 1.1, 0.5],
         "quats": generator.normal(size=(num, 4)),
@@ -113,7 +116,8 @@ def start(num: int, generator: np.random.Generator, device: str) -> dict[str, to
 
 
 def activated(parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """As they are drawn."""
+    """Return the parameters as they are drawn, with scales and opacities instead of
+    logarithms and logits."""
     scales, opacities = parameters["scales"].exp(), parameters["opacities"].sigmoid()
     return {**parameters, "scales": scales, "opacities": opacities}
 

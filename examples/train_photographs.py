@@ -1,15 +1,18 @@
-"""Train gaussians to photographs, with gsplat's DefaultStrategy and v3dg's pictures and
-gradients.
+"""Train gaussians on photographs with gsplat's DefaultStrategy. v3dg draws the pictures
+and computes the gradients.
 
-Takes a folder as COLMAP's `image_undistorter` writes it, with `images/` and a model in
-`sparse/` or `sparse/0`; or one with a `transforms.json` whose photographs have no
-distortion. Every eighth photograph is held out, and what is trained is measured on
-those. Rates and schedule are those of gsplat's `simple_trainer.py`, but for how long it
-grows. docs/photographs.md goes on from there.
+The input is a folder in the layout of COLMAP's `image_undistorter`, with photographs in
+`images/` and a model in `sparse/` or `sparse/0`; or a folder with a `transforms.json`
+whose photographs have no distortion. Every eighth photograph is held out, and the
+result is measured on these photographs. Learning rates and schedule are those of
+gsplat's `simple_trainer.py`, except that gaussians are added only in the first half of
+the steps. docs/photographs.md describes the next steps.
 
-Needs torch and gsplat, pycolmap for models of COLMAP, and a GPU for more than a few
-hundred steps: pip install '.[torch,colmap]' gsplat==1.5.3 && python
-examples/train_photographs.py capture/
+The example needs torch and gsplat; pycolmap, if the folder has a model of COLMAP; and a
+GPU for more than a few hundred steps:
+
+    pip install '.[torch,colmap]' gsplat==1.5.3
+    python examples/train_photographs.py capture/
 """
 
 from __future__ import annotations
@@ -30,33 +33,34 @@ import v3dg
 from v3dg.compat.gsplat import rasterization
 from v3dg.pictures import contact_sheet, to_8bit, write_picture
 
-C0 = 0.28209479177387814  # of the constant spherical harmonic
-HELD_OUT = 8  # one photograph in so many
-STRUCTURE = 0.2  # part of the loss that is 1 - SSIM
-DEGREE_EVERY = 1000  # steps, until the harmonics of the next degree are drawn, too
+C0 = 0.28209479177387814  # the constant spherical harmonic
+HELD_OUT = 8  # one of this many photographs is held out
+STRUCTURE = 0.2  # weight of 1 - SSIM in the loss
+DEGREE_EVERY = 1000  # number of steps after which the next SH degree is drawn, too
 
 
 @dataclass
 class Config:
-    """Train gaussians to photographs."""
+    """Train gaussians on photographs."""
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Folder with photographs and cameras."""
     output: Path = Path("trained.ply")
-    """Asset to write; beside it a .jpg of the photographs that were held out and what
-    it shows there."""
+    """Asset to write. A .jpg beside it shows held-out photographs and the asset's
+    pictures of the same views."""
     steps: int = 7000
-    """Steps, of one photograph each."""
+    """Number of steps, each with one photograph."""
     longest: int = 1200
-    """Longer side of a photograph in px; larger ones are made smaller."""
+    """Maximum length in px of the longer side of a photograph; larger photographs are
+    scaled down."""
     start: int = 50_000
-    """Gaussians to start with where there are no points of COLMAP."""
+    """Initial number of gaussians, if there are no points of COLMAP."""
     sh_degree: int = 3
-    """Of the colours: 0 to 3."""
+    """SH degree of the colours, 0 to 3."""
     device: str = "cuda"
-    """Where to train: cuda or cpu."""
+    """Device for the training: cuda or cpu."""
     seed: int = 0
-    """For the order of photographs, and what random is in the strategy."""
+    """Seed of the order of photographs and of the strategy's random numbers."""
 
 
 @dataclass
@@ -68,15 +72,14 @@ class Photograph:
 
 
 def main(config: Config) -> float:
-    """Write the asset, and return the mean PSNR of the photographs that were held out,
-    in dB."""
+    """Write the asset; return its mean PSNR in dB on the held-out photographs."""
     torch.manual_seed(config.seed)
     photographs = read_photographs(config)
     held_out = photographs[::HELD_OUT]
     trained_on = [photograph for k, photograph in enumerate(photographs) if k % HELD_OUT]
     if not trained_on:
         raise SystemExit(
-            f"{config.capture}: expected two photographs or more, got {len(photographs)}"
+            f"{config.capture}: expected at least two photographs, got {len(photographs)}"
         )
     print(f"{len(trained_on)} photographs to train on, {len(held_out)} held out", flush=True)
     parameters = start(config, [photograph.camera for photograph in photographs])
@@ -99,15 +102,15 @@ def main(config: Config) -> float:
     mean = float(np.mean(decibels))
     num = len(parameters["means"])
     print(
-        f"{config.output}: {num:,} gaussians, {seconds:.0f} s, {mean:.2f} dB on photographs held "
-        "out"
+        f"{config.output}: {num:,} gaussians, {seconds:.0f} s, {mean:.2f} dB on held-out "
+        "photographs"
     )
     return mean
 
 
 def read_photographs(config: Config) -> list[Photograph]:
-    """In the order of their names, no larger than is asked for, with cameras of that
-    size."""
+    """Return the photographs in the order of their names, scaled down to the maximum
+    size, with cameras of the scaled size."""
     listed = config.capture / "transforms.json"
     cameras = v3dg.read_cameras(listed if listed.is_file() else config.capture)
     folder = config.capture if listed.is_file() else config.capture / "images"
@@ -130,8 +133,8 @@ def read_photographs(config: Config) -> list[Photograph]:
 
 
 def start(config: Config, cameras: list[v3dg.Camera]) -> dict[str, torch.nn.Parameter]:
-    """A gaussian at each of COLMAP's points, or anywhere around what the cameras look
-    at."""
+    """Return a gaussian at each of COLMAP's points; without points, at random positions
+    around the point where the cameras look."""
     points, colors = points_of(config, cameras)
     num = len(points)
     rest = (config.sh_degree + 1) ** 2 - 1
@@ -150,7 +153,7 @@ def start(config: Config, cameras: list[v3dg.Camera]) -> dict[str, torch.nn.Para
 
 
 def points_of(config: Config, cameras: list[v3dg.Camera]) -> tuple[torch.Tensor, torch.Tensor]:
-    """(N, 3) points, and their colours in [0,1]."""
+    """Return (N, 3) points, and their colours (N, 3) in [0,1]."""
     models = [
         config.capture / part for part in ("sparse/0", "sparse") if (config.capture / part).is_dir()
     ]
@@ -172,8 +175,8 @@ def points_of(config: Config, cameras: list[v3dg.Camera]) -> tuple[torch.Tensor,
 
 
 def looked_at(cameras: list[v3dg.Camera]) -> tuple[np.ndarray, float]:
-    """The point that is nearest to all lines of sight, and how far the cameras are from
-    it."""
+    """Return the point nearest to the lines of sight of all cameras, and the distance
+    of the farthest camera from this point."""
     positions = np.array([camera.position for camera in cameras])
     across = [
         np.eye(3) - np.outer(camera.viewmat[2, :3], camera.viewmat[2, :3]) for camera in cameras
@@ -185,8 +188,8 @@ def looked_at(cameras: list[v3dg.Camera]) -> tuple[np.ndarray, float]:
 
 
 def nearest(points: torch.Tensor) -> torch.Tensor:
-    """How far a point is from others: the root mean square of the distances to the
-    three nearest."""
+    """Return (N,) the distance of each point from its neighbours: the root mean square
+    of the distances to the three nearest points."""
     distances = [
         torch.cdist(part, points).topk(min(4, len(points)), largest=False).values
         for part in points.split(1024)
@@ -197,8 +200,8 @@ def nearest(points: torch.Tensor) -> torch.Tensor:
 def train(
     parameters: dict[str, torch.nn.Parameter], photographs: list[Photograph], config: Config
 ) -> None:
-    """Change the parameters, and how many there are, until they look like the
-    photographs."""
+    """Train the parameters on the photographs, in place. The number of gaussians
+    changes, too."""
     from gsplat import DefaultStrategy
 
     positions = np.array([photograph.camera.position for photograph in photographs])
@@ -218,7 +221,7 @@ def train(
     decay = torch.optim.lr_scheduler.ExponentialLR(
         optimizers["means"], 0.01 ** (1 / max(1, config.steps))
     )
-    # Gaussians are made half of the way, and settle in the other half.
+    # Gaussians are added in the first half of the steps, and settle in the second half.
     strategy = DefaultStrategy(refine_stop_iter=config.steps // 2)
     strategy.check_sanity(parameters, optimizers)
     state = strategy.initialize_state(scene_scale=size)
@@ -269,7 +272,7 @@ def target_of(photograph: Photograph, device: str) -> torch.Tensor:
 
 
 def structure(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """SSIM of (1, H, W, 3) pictures with a window of 11 px."""
+    """Return the SSIM of (1, H, W, 3) pictures, with a window of 11 x 11 px."""
     bell = torch.exp(-((torch.arange(11, device=first.device) - 5.0) ** 2) / (2 * 1.5**2))
     bell = (bell / bell.sum()).expand(3, 1, 11)
 

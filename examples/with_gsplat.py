@@ -1,7 +1,10 @@
-"""Choose what one view needs with v3dg, and draw it with gsplat: a selection is
-gaussians for any rasterizer.
+"""Select the gaussians for a view with v3dg, and draw them with gsplat. The gaussians
+of a selection can be drawn by any rasterizer.
 
-Needs a GPU: pip install '.[torch]' gsplat==1.5.3 && python examples/with_gsplat.py
+The example needs a GPU:
+
+    pip install '.[torch]' gsplat==1.5.3
+    python examples/with_gsplat.py
 """
 
 from __future__ import annotations
@@ -21,22 +24,22 @@ from v3dg.pictures import write_picture
 
 @dataclass
 class Config:
-    """Draw a field of donuts, or copies of a bundle, with gsplat."""
+    """Draw a field of donuts, or of copies of a bundle, with gsplat."""
 
     bundle: Path | None = None
-    """Bundle to show; a donut that is made here if not given."""
+    """Bundle to draw; by default a generated donut."""
     output: Path = Path("with_gsplat.png")
     """Picture to write."""
     rows: int = 20
-    """The field has rows x rows instances."""
+    """Number of instances per side of the square field."""
     size: tuple[int, int] = (1280, 720)
-    """Width and height in px."""
+    """Width and height of the picture in px."""
     tolerance: float = v3dg.DEFAULT_TOLERANCE
-    """Screen area in px² that one gaussian of a coarser cluster may stand for."""
+    """Maximum screen area in px² for each gaussian of a coarser cluster."""
 
 
 def main(config: Config) -> float:
-    """Write the picture, and return how near it is to v3dg's own, in dB."""
+    """Write the picture; return its PSNR in dB against v3dg's picture."""
     import gsplat
 
     scene, camera = make_scene(config)
@@ -54,10 +57,10 @@ def main(config: Config) -> float:
 
 
 def gsplat_arguments(selection: v3dg.Selection, camera: v3dg.Camera, device: str) -> dict[str, Any]:
-    """What `gsplat.rasterization` takes to draw a selection.
+    """Return the arguments with which `gsplat.rasterization` draws a selection.
 
-    Gaussians are taken relative to the camera, which is then at the origin: far from
-    the world's origin nothing is lost to float32.
+    Positions are relative to the camera, which is then at the origin. So float32 is
+    precise enough even far from the origin of the world.
     """
     import torch
 
@@ -82,14 +85,15 @@ def gsplat_arguments(selection: v3dg.Selection, camera: v3dg.Camera, device: str
 
 
 def filter_of(scene: v3dg.Scene) -> float:
-    """What level 1 of the first bundle is drawn with: gsplat has one filter for all
-    gaussians."""
+    """Return the filter variance in px² of level 1 of the first bundle. It is used for
+    all gaussians, because gsplat has only one filter for a picture."""
     clusters = scene.bundles[0].clusters
     return float(clusters.filter_px2[clusters.level == 1].max(initial=0.0))
 
 
 def make_scene(config: Config) -> tuple[v3dg.Scene, v3dg.Camera]:
-    """A square of instances, seen from above one of its sides."""
+    """Return a scene with a square of instances, and a camera above one of its
+    sides."""
     if config.bundle is None:
         bundle = v3dg.build_bundle(make_donut(), device="auto")
     else:
@@ -109,7 +113,7 @@ def make_scene(config: Config) -> tuple[v3dg.Scene, v3dg.Camera]:
 
 
 def num_gaussians(scene: v3dg.Scene) -> int:
-    """Gaussians of all instances at full detail."""
+    """Return the number of gaussians of all instances at full detail."""
     sizes = np.array([bundle.info()["levels"][0]["gaussians"] for bundle in scene.bundles])
     return int(sizes[scene.instance_bundle].sum())
 

@@ -1,7 +1,8 @@
 """The cameras of COLMAP's models, from `cameras` and `images`, binary or text.
 
-Newer models have `rigs` and `frames`, too, of which the poses in `images` follow.
-Source: COLMAP's documentation, Output Format, and its table of camera models.
+Newer models also have `rigs` and `frames`. They are not needed, because `images`
+contains the resulting poses. Source: COLMAP's documentation, Output Format, and its
+table of camera models.
 """
 
 import codecs
@@ -28,9 +29,9 @@ _MAX_NAME_BYTES = 1 << 16
 _COUNT = struct.Struct("<Q")
 _LENS = struct.Struct("<IiQQ")  # id, model, width, height
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, id of the lens
-_POINT_BYTES = 24  # x, y and the number of a point
-_IMAGE_WORDS = 9  # of a line of text, before the name
-# NaN and infinity as the runtime libraries of Windows print them.
+_POINT_BYTES = 24  # x, y and the index of a 3D point
+_IMAGE_WORDS = 9  # words in a line before the name of the image
+# NaN and infinity as printed by the C libraries of Windows.
 _WINDOWS_NOT_FINITE = re.compile(
     rb"[+-]?(?:s?nan\(\w*\)|1\.#(?:IND|INF|QNAN|SNAN)\d*)", re.IGNORECASE
 )
@@ -43,11 +44,12 @@ class _Model(NamedTuple):
     """A camera model.
 
     Attributes:
-        num_focal: Focal lengths, which are the first parameters; the centre follows.
-        num_distortion: Parameters of the lens after these.
-        projection: Name of the projection if the distortion is 0.
-        terms: The terms of OpenCV's models that the parameters after the centre are, or
-            None for another model of distortion.
+        num_focal: Number of focal lengths, which are the first parameters. The
+            principal point follows.
+        num_distortion: Number of distortion parameters, which are the last ones.
+        projection: The projection of a lens without distortion.
+        terms: The terms of OpenCV's models that the parameters after the principal
+            point are; None for another model of distortion.
     """
 
     name: str
@@ -77,15 +79,15 @@ _MODELS = (
     _Model("EUCM", 2, 2, "pinhole"),
     _Model("EQUIRECTANGULAR", 0, 0, "sphere"),
 )
-_NUM_WIDTH_HEIGHT = 2  # the parameters of EQUIRECTANGULAR
+_NUM_WIDTH_HEIGHT = 2  # EQUIRECTANGULAR has the width and the height as parameters
 
 
 @dataclass(frozen=True)
 class Lens:
-    """An image's size and lens, which COLMAP calls a camera.
+    """The size of an image and its lens. COLMAP calls both together a camera.
 
     Attributes:
-        distortion: Parameters of the lens beside focal lengths and centre.
+        distortion: The distortion parameters.
     """
 
     model: _Model
@@ -98,7 +100,8 @@ class Lens:
     @property
     def is_distorted(self) -> bool:
         if self.model.name == "EUCM":
-            return self.distortion[0] != 0  # its other parameter then has no effect
+            # If this is 0, the other parameter has no effect.
+            return self.distortion[0] != 0
         return any(self.distortion)
 
     @property
@@ -123,7 +126,7 @@ class Lens:
 @dataclass(frozen=True)
 class Image:
     """A registered image: its name, its lens, and the (4, 4) matrix from world to
-    camera. Numbers that the file has as NaN or infinity stay so."""
+    camera. NaN and infinity in the file are preserved."""
 
     name: str
     lens: Lens
@@ -135,8 +138,8 @@ class Image:
 
 
 def read_model(images: Path) -> list[Image]:
-    """Read the images of a model in the order of their ids, by its `images.bin` or
-    `images.txt`, beside which the file of the cameras is.
+    """Read the images of a model, in the order of their ids, from its `images.bin` or
+    `images.txt` and the file with the cameras in the same folder.
 
     Raises:
         ValueError: The content is not valid; the message names the file.
@@ -150,9 +153,9 @@ def read_model(images: Path) -> list[Image]:
         for number, quaternion, translation, lens, name in _IMAGE_READERS[images.suffix](
             images, file
         ):
-            check(images, number not in entries, f"each image once, got {number} twice")
-            expected = f"image {number} with a camera of {lens_file.name}"
-            check(images, lens in lenses, f"{expected}, got {lens}")
+            check(images, number not in entries, f"distinct image ids, got {number} twice")
+            expected = f"a camera of image {number} that {lens_file.name} contains"
+            check(images, lens in lenses, f"{expected}, got camera {lens}")
             entries[number] = Image(name, lenses[lens], _viewmat(quaternion, translation))
     return [entries[number] for number in sorted(entries)]
 
@@ -174,7 +177,7 @@ def _viewmat(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> F
     viewmat = np.eye(4)
     if not all(map(math.isfinite, quaternion)):
         viewmat[:3, :3] = math.nan
-    elif any(quaternion):  # Camera refuses a matrix of zeros
+    elif any(quaternion):  # Camera rejects a zero matrix
         viewmat[:3, :3] = rotation_from_quaternion(normalised(np.array(quaternion)))
     else:
         viewmat[:3, :3] = 0
@@ -213,10 +216,15 @@ def _take(path: Path, file: IO[bytes], size: int) -> bytes:
 
 
 def _count(path: Path, file: IO[bytes], least_bytes: int) -> int:
-    """Read a number of entries; ValueError if the file has too few bytes for them."""
+    """Read a number of entries; raise ValueError if the file is too short for so
+    many."""
     (count,) = _COUNT.unpack(_take(path, file, _COUNT.size))
     num_bytes = os.fstat(file.fileno()).st_size
-    check(path, count <= num_bytes // least_bytes, f"{count} entries, got {num_bytes} bytes")
+    check(
+        path,
+        count <= num_bytes // least_bytes,
+        f"{count} entries, got a file of {num_bytes} bytes; is it complete?",
+    )
     return int(count)
 
 
@@ -224,7 +232,7 @@ def _binary_lenses(path: Path, file: IO[bytes]) -> Iterator[tuple[int, Lens]]:
     for _ in range(_count(path, file, _LENS.size)):
         number, kind, width, height = _LENS.unpack(_take(path, file, _LENS.size))
         is_known = 0 <= kind < len(_MODELS)
-        check(path, is_known, f"a known model of camera {number}, got number {kind}")
+        check(path, is_known, f"a known model for camera {number}, got model number {kind}")
         model = _MODELS[kind]
         size = _num_parameters(model)
         parameters = struct.unpack(f"<{size}d", _take(path, file, 8 * size))
@@ -244,8 +252,8 @@ def _binary_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
 
 
 def _binary_name(path: Path, file: IO[bytes]) -> str:
-    """Read a name up to its final zero byte; the file's position is then after that
-    byte."""
+    """Read a name up to its terminating zero byte. Afterwards, the file's position is
+    behind that byte."""
     start = file.tell()
     for num_bytes in (_USUAL_NAME_BYTES, _MAX_NAME_BYTES):
         file.seek(start)
@@ -259,13 +267,13 @@ def _binary_name(path: Path, file: IO[bytes]) -> str:
 
 
 def _text(content: bytes) -> str:
-    """Decode a name in UTF-8; bytes of another encoding become escapes."""
+    """Decode a name in UTF-8; bytes that are not UTF-8 become escapes."""
     return content.decode("utf-8", errors="backslashreplace")
 
 
 def _number(word: bytes) -> float:
-    """A number of a text, NaN for each that is not finite; ValueError for other
-    words."""
+    """Return the number in a word of text; infinite numbers become NaN. Raise
+    ValueError if the word is not a number."""
     if _WINDOWS_NOT_FINITE.fullmatch(word):
         return math.nan
     return float(word)
@@ -317,8 +325,8 @@ def _text_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
 
 
 def _check_points(path: Path, numbered: tuple[int, bytes]) -> None:
-    """Raise ValueError unless a line has the points of an image. It may be empty, but
-    where it is missing the next image would be taken for it."""
+    """Raise ValueError unless a line is a list of the points of an image. The line may
+    be empty, but if it were missing, the next image would be read in its place."""
     number, line = numbered
     words = line.split()
     try:

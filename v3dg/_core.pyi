@@ -1,4 +1,4 @@
-"""Types of the compiled module."""
+"""Types of the compiled module v3dg._core."""
 
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -7,9 +7,9 @@ from typing import Any, Literal, TypeAlias, overload
 import numpy as np
 from numpy.typing import NDArray
 
-# NumPy's on the host, torch's on a CUDA device. It cannot be narrower: torch need not
-# be installed, so its tensor has no type here, and which of the two a result is follows
-# from the device, which no type knows.
+# A NumPy array on the host, or a torch tensor on a CUDA device. The type cannot be
+# narrower: torch may not be installed, so its tensor has no type here, and the device
+# that decides between the two is not part of any type.
 Array: TypeAlias = Any
 
 Float32: TypeAlias = NDArray[np.float32]
@@ -26,9 +26,8 @@ sh_base0: float
 def isa() -> str: ...
 def num_cuda_devices() -> int: ...
 
-# types
 class Camera:
-    """A camera, or a window of its image, as every operation takes it."""
+    """A camera of any model, or a window of its image."""
 
     def __init__(
         self,
@@ -56,7 +55,7 @@ class Camera:
     def height(self) -> int: ...
 
 class Eyes:
-    """Two cameras that look the same way and share a cut; or a camera."""
+    """Two cameras that look the same way and share a cut; or a single camera."""
 
     @overload
     def __init__(self, camera: Camera) -> None: ...
@@ -64,7 +63,7 @@ class Eyes:
     def __init__(self, left: Camera, right: Camera) -> None: ...
 
 class Rule:
-    """What a selection chooses."""
+    """The rule of a selection: which clusters it chooses."""
 
     def __init__(
         self,
@@ -81,7 +80,7 @@ class Rule:
     def tolerance_px2(self) -> float: ...
 
 class Instances:
-    """Instances of bundles; borrows the arrays, which are on the host."""
+    """Instances of bundles. Borrows the arrays, which are on the host."""
 
     def __init__(
         self,
@@ -111,9 +110,8 @@ Columns: TypeAlias = tuple[Array, Array, Array, Array, Array]
 
 def sh_bases(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64]: ...
 
-# ply
 class PlyFile:
-    """A .ply file of gaussians, read in runs of rows."""
+    """A .ply file with gaussians, which is read in ranges of rows."""
 
     def __init__(self, path: str | PathLike[str]) -> None: ...
     @property
@@ -122,7 +120,7 @@ class PlyFile:
     def sh_degree(self) -> int: ...
     @property
     def used(self) -> list[str]:
-        """Names of the properties that are read."""
+        """Names of the properties that are used."""
 
     def read(self, first: int, last: int) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
 
@@ -141,14 +139,13 @@ def ply_write(
     comments: list[str] = [],
 ) -> None: ...
 
-# cluster
 nesting_margin: float
 min_radius: float
 most_length: float
 
 def examine(gaussians: Rows) -> NDArray[np.uint16]: ...
 def num_halvings(count: int, cluster_size: int) -> int: ...
-def median_split(means: Array, offset: Int64, depth: int) -> tuple[Array, Int64]: ...
+def median_split(means: Array, offset: Int64, depth: int, unit: int = 1) -> tuple[Array, Int64]: ...
 def check_tables(
     offset: Int64,
     level: Int32,
@@ -168,24 +165,19 @@ def check_tables(
 def morton_order(means: Float32) -> Int64: ...
 def bound_spheres(spheres: Array, offset: Int64) -> Array: ...
 def bound_by_boxes(gaussians: Rows, offset: Int64) -> Array: ...
-
-# simplify
 def prune(gaussians: Rows, in_offset: Int64, out_offset: Int64) -> Array: ...
 def merge(gaussians: Rows, in_offset: Int64, out_offset: Int64) -> Columns: ...
-
-# quantize
 def codebook_of(values: Float64) -> Float64: ...
 def palette_of(vectors: Float32, size: int) -> tuple[Float64, NDArray[np.uint32]]: ...
 def page_code_bytes(sh_degree: int) -> tuple[int, int, int]: ...
 def encode_page(gaussians: Rows, offset: Int64) -> Int32: ...
 def decode_page(page: Int32, offset: Int64, out: Rows) -> None: ...
 
-# pages
 DAMAGED: str
 HASH_PIECE_BYTES: int
 
 class PageRun:
-    """Neighbouring pages of a file; borrows the arrays."""
+    """Neighbouring pages of a file. Borrows the arrays."""
 
     def __init__(
         self, *, first_page: int, first_cluster: Int64, offset: Int64, places: Int64
@@ -213,13 +205,12 @@ class HashedReader:
     ) -> HashedRead: ...
 
 class Codes:
-    """All pages of a bundle as codes, on the host; borrows the arrays."""
+    """All pages of a bundle as codes, on the host. Borrows the arrays."""
 
     def __init__(
         self, pages: Int32, first_cluster: Int64, offset: Int64, sh_degree: int
     ) -> None: ...
 
-# gather
 def gather(
     *,
     bundles: Sequence[Rows],
@@ -232,9 +223,8 @@ def gather(
 ) -> Columns: ...
 def transform(rows: Rows, quaternion: Float64, position: Float64, scale: float) -> Columns: ...
 
-# select
 class ClusterTable:
-    """What selection and drawing read of a bundle's clusters."""
+    """The tables of a bundle's clusters that selection and drawing read."""
 
     def __init__(
         self,
@@ -254,7 +244,7 @@ class ClusterTable:
     def bytes_on(self, device: int) -> int: ...
 
 class Cut:
-    """The clusters that one view needs, and what their selection came to."""
+    """The result of a selection: the clusters that one view needs, and statistics."""
 
     @property
     def instance_ids(self) -> Int32: ...
@@ -276,12 +266,12 @@ def group_metrics(
     tables: Sequence[ClusterTable], instances: Instances, camera: Camera, rule: Rule
 ) -> tuple[Float32, Int64]: ...
 
-# rasterize
 class Tape:
-    """What rasterize leaves for rasterize_backward; it keeps the gaussians."""
+    """The data that rasterize stores for rasterize_backward. It keeps the gaussians
+    alive."""
 
 class RenderCounts:
-    """What a picture came to on the host."""
+    """Statistics of a picture that was drawn on the host."""
 
     @property
     def in_frustum(self) -> int: ...
@@ -300,11 +290,11 @@ class Rasterized:
     """A picture of gaussians without levels.
 
     Attributes:
-        color: (H, W, 3).
-        alpha: (H, W).
-        depth: (H, W), or None.
-        counts: None where a device drew it.
-        tape: None where it is not kept.
+        color: (H, W, 3) colour over the background.
+        alpha: (H, W) opacity.
+        depth: (H, W) expected depth; None unless it was requested.
+        counts: Statistics; None if a CUDA device drew the picture.
+        tape: Data for the backward pass; None unless it was requested.
     """
 
     @property
@@ -319,11 +309,12 @@ class Rasterized:
     def tape(self) -> Tape | None: ...
 
 class Gradients:
-    """Gradients of a picture, by what it was drawn of.
+    """Gradients with respect to the inputs of a picture.
 
     Attributes:
-        centers: (N, 2), by the centres on the image, or None.
-        center_sizes: (N, 2), the sum of absolute values of each pixel's share, or None.
+        centers: (N, 2) gradient with respect to the centres on the image, or None.
+        center_sizes: (N, 2) sum over pixels of the absolute gradients with respect to
+            the centres, or None.
     """
 
     @property
@@ -344,14 +335,14 @@ class Gradients:
     def center_sizes(self) -> Array | None: ...
 
 class Ellipses:
-    """Gaussians on an image; zeros for those that are not in sight.
+    """The projections of gaussians onto an image; zeros for invisible gaussians.
 
     Attributes:
-        centers: (N, 2), px.
-        depths: (N,).
-        conics: (N, 3).
-        opacities: (N,).
-        radii: (N, 2) int32, px.
+        centers: (N, 2) in px.
+        depths: (N,) in world units.
+        conics: (N, 3) inverse covariances, px⁻².
+        opacities: (N,) after compensation for the filter.
+        radii: (N, 2) int32, in px.
     """
 
     @property
@@ -385,8 +376,8 @@ def rasterize_backward(
     with_sizes: bool = ...,
 ) -> Gradients: ...
 
-# How many times larger balls of level 1 are to be, (G, 4); and balls of each level
-# after they have grown.
+# Returns (G,) the factors by which the balls of level 1 must grow, so that groups are
+# selected at a suitable size.
 def first_selected(
     leaves: Rows,
     level: Rows,
@@ -408,9 +399,8 @@ def ellipses(
     min_radius_px: float,
 ) -> Ellipses: ...
 
-# scene
 class Stop:
-    """Asks, from any thread, for a picture under way to be given up: it is then left
+    """A flag with which any thread can stop a picture in progress, which then stays
     unfinished."""
 
     def request(self) -> None: ...
@@ -418,7 +408,7 @@ class Stop:
     def is_requested(self) -> bool: ...
 
 class FrameStats:
-    """What a frame came to; times in milliseconds."""
+    """Statistics of a frame; times are in milliseconds."""
 
     @property
     def gaussians(self) -> int: ...
@@ -472,7 +462,7 @@ def ramp(values: NDArray[Any]) -> Float32: ...
 def missing_colors(values: NDArray[Any]) -> Float32: ...
 
 class Model:
-    """Gaussians as frames of their device read them."""
+    """Gaussians in the layout that frames of their device read."""
 
     @overload
     def __init__(self, gaussians: Rows) -> None: ...
@@ -484,10 +474,10 @@ class Model:
     def decode(self, cluster_ids: Int32) -> Columns: ...
 
 class BudgetSteps:
-    """What pictures with a budget know of the ones before."""
+    """The state of a sequence of pictures with a budget."""
 
 class ResidentScene:
-    """What selection reads of a scene, on one device."""
+    """The data of a scene that selection reads on one device."""
 
     def __init__(self, device: int) -> None: ...
     def set_bundles(self, tables: list[ClusterTable]) -> None: ...
@@ -507,7 +497,7 @@ class ResidentScene:
     def page_needs(self, camera: Camera, rule: Rule) -> list[Float32]: ...
 
 class PoolStatus:
-    """What of the pages is there, and what is missing."""
+    """The state of a pool: resident and missing pages, and errors."""
 
     @property
     def num_slots(self) -> int: ...
@@ -531,7 +521,7 @@ class PoolStatus:
     def is_damage(self) -> bool: ...
 
 class SettlingStep:
-    """What a step towards a settled view found out."""
+    """The result of one step towards a settled view."""
 
     @property
     def tolerance_px2(self) -> float: ...
@@ -541,12 +531,12 @@ class SettlingStep:
     def num_absent(self) -> int: ...
 
 class FileSource:
-    """The file that pages of a bundle are in.
+    """The file that contains the pages of a bundle.
 
     Args:
-        places: (P+1,) first byte of each page, and the end.
-        hashes: (P, 16).
-        fetch: Called with ranges of bytes before they are read; None: all are there.
+        places: (P+1,) offset of each page in the file, and the end.
+        hashes: (P, 16) hashes of the pages.
+        fetch: Called with ranges of bytes before they are read; None for a local file.
     """
 
     def __init__(
@@ -562,7 +552,7 @@ class FileSource:
     ) -> None: ...
 
 class PagePool:
-    """Pages of bundles in a fixed amount of memory of one device."""
+    """A pool: memory of a fixed size on one device for pages of bundles."""
 
     def __init__(
         self,
@@ -583,23 +573,23 @@ class PagePool:
     def read_one(self) -> bool: ...
 
 class Palette:
-    """Colours of a bundle's clusters, in which gaussians can be drawn."""
+    """Colours for a bundle's clusters, in which gaussians can be drawn."""
 
     def __init__(self, table: ClusterTable, sh: NDArray[np.float32], device: int) -> None: ...
 
 class Shade:
-    """What is behind a picture, when its pixels stop, and whether their depth is
-    drawn."""
+    """The background of a picture, the transmittance at which its pixels stop, and
+    whether depth is drawn."""
 
     def __init__(
         self, *, background: Sequence[float], min_transmittance: float, with_depth: bool
     ) -> None: ...
 
 class GivenCut:
-    """A cut that was selected before; borrows the arrays.
+    """A cut that was selected earlier. Borrows the arrays.
 
     Args:
-        weights: 0 to 1; None where all are 1.
+        weights: (S,) weights of clusters, 0 to 1; None if all are 1.
     """
 
     def __init__(
@@ -607,15 +597,19 @@ class GivenCut:
     ) -> None: ...
 
 class Look:
-    """What a picture shows in place of the frame's own colours, and of which cut.
+    """The colours that a picture shows instead of the frame's own colours, and the
+    choice of its cut.
 
     Args:
-        shows: "error" shows the share of the tolerance that metrics take, "count" how
-            many gaussians a pixel is blended of, in place of depth, "residency" where
-            pages are missing; anything else, the gaussians' or palettes' own colours.
-        colors: (C, 3) of each bundle, of a pool: colours of its clusters.
-        chooser: Whom the cut is selected for.
-        aside: From a pool: what was resident for the last picture.
+        shows: "error" shows metrics as fractions of the tolerance; "count" replaces
+            depth by the number of gaussians that a pixel blends; "residency" shows
+            where pages are missing. Any other value shows the colours of the gaussians
+            or of a palette.
+        colors: For a pool: (C, 3) colours of the clusters of each bundle.
+        chooser: The camera for which the cut is selected; None for the camera of the
+            picture.
+        aside: For a pool: whether to draw only pages that were resident for the last
+            picture, without requesting any.
     """
 
     def __init__(
@@ -627,13 +621,13 @@ class Look:
     ) -> None: ...
 
 class FrameRequest:
-    """One picture that is asked of a frame.
+    """The request for one picture.
 
     Args:
-        rule: What is selected; with a cut, the tolerance that metrics are compared
-            with.
-        cut: A cut that is drawn in place of what the rule selects.
-        look: What it shows; None for the frame's own colours.
+        rule: The rule of the selection. With a cut, only its tolerance is used, for
+            metrics.
+        cut: A cut that is drawn instead of a selected one.
+        look: The colours that the picture shows; None for the frame's own colours.
     """
 
     def __init__(
@@ -646,7 +640,7 @@ class FrameRequest:
     ) -> None: ...
 
 class Pick:
-    """The gaussian that a pixel shows most of."""
+    """The gaussian with the largest weight in a pixel."""
 
     @property
     def instance(self) -> int: ...
@@ -658,8 +652,8 @@ class Pick:
     def depth(self) -> float: ...
 
 class SceneFrame:
-    """Draws scenes of the same bundles on one device: the models that were set, or what
-    is resident in a pool."""
+    """Draws scenes with the same bundles on one device, from models that were set, or
+    from the resident part of a pool."""
 
     def __init__(self, device: int) -> None: ...
     def set_models(self, models: list[Model], palettes: list[Palette]) -> None: ...
@@ -677,16 +671,15 @@ class SceneFrame:
     def memory(self) -> dict[str, int]: ...
 
 class AssetFrame:
-    """Draws gaussians without levels on the device that they are on."""
+    """Draws gaussians without levels on the device where they are."""
 
     def __init__(
         self, model: Model, *, filter_px2: float = 0.0, antialiased: bool = False
     ) -> None: ...
     def draw(self, camera: Camera, shade: Shade, stop: Stop | None = None) -> Drawing: ...
 
-# fit_level
 class FitConfig:
-    """How groups are fitted; a setting that is left out is an error."""
+    """The settings of a fit. All of them are required."""
 
     def __init__(
         self,
@@ -716,7 +709,7 @@ class FitConfig:
     ) -> None: ...
 
 class FitProgress:
-    """How far a fit is, to be looked at and cancelled from any thread."""
+    """The progress of a fit. Any thread may read it and cancel the fit."""
 
     @property
     def groups_done(self) -> int: ...
@@ -736,11 +729,11 @@ class CutPictures:
     def view(self, number: int, cut: int = 0) -> tuple[Camera, Int32, int]: ...
 
 class FitTarget:
-    """The gaussians that groups should look like."""
+    """The gaussians to which groups are fitted."""
 
     def __init__(self, gaussians: Rows, filter_px2: float, antialiased: bool) -> None: ...
 
-# Writes over `gaussians`; returns the residuals (G, 2).
+# Overwrites `gaussians`; returns (G, 2) the remaining errors of the groups.
 def fit_level(
     config: FitConfig,
     target: FitTarget,
@@ -752,9 +745,9 @@ def fit_level(
     progress: FitProgress,
 ) -> Float32: ...
 
-# Writes over `gaussians`.
+# The comparison of cuts with the asset. `refine_cuts` overwrites `gaussians`.
 class CutComparison:
-    """How cuts are compared with the asset."""
+    """The number of windows in a step of a refinement, and of cuts for each view."""
 
     def __init__(self, *, windows_per_step: int, cuts_per_view: int) -> None: ...
 

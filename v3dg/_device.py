@@ -33,8 +33,8 @@ class Device:
         return "cpu"
 
     def current(self) -> AbstractContextManager[object]:
-        """Make this torch's current device inside the context; does nothing for the
-        CPU."""
+        """Return a context in which this is torch's current device. For the CPU, the
+        context does nothing."""
         if not self.is_cuda:
             return nullcontext()
         import torch
@@ -46,13 +46,13 @@ CPU = Device()
 
 
 def resolve(device: str | Device) -> Device:
-    """Return the device that "auto", "cpu", "cuda" or "cuda:1" means.
+    """Return the device with the name "auto", "cpu", "cuda" or, for example, "cuda:1".
 
-    "cuda" means torch's current device. "auto" means the same if CUDA can be used, else
-    the CPU.
+    "cuda" means torch's current CUDA device. "auto" means "cuda" if CUDA can be used,
+    otherwise "cpu".
 
     Raises:
-        ValueError: The name is not one of these.
+        ValueError: The name is unknown.
         RuntimeError: A CUDA device was requested and cannot be used; there is no
             fallback to the CPU.
     """
@@ -68,7 +68,9 @@ def resolve(device: str | Device) -> Device:
     if missing is None:
         count = _core.num_cuda_devices()
         if int(number or 0) >= count:
-            raise RuntimeError(f"device: expected one of {count} CUDA devices, got {name!r}")
+            raise RuntimeError(
+                f"device: expected the index of one of {count} CUDA devices, got {name!r}"
+            )
         import torch
 
         if number:
@@ -80,26 +82,27 @@ def resolve(device: str | Device) -> Device:
 
 
 def missing_for_cuda() -> str | None:
-    """Return the reason why CUDA cannot be used, and what to do; None if it can be
+    """Return the reason why CUDA cannot be used, with advice; None if it can be
     used."""
     if not _core.has_cuda:
         return "v3dg was built without CUDA; install it again where nvcc is found"
     if _core.num_cuda_devices() == 0:
-        return "expected a CUDA device and its driver, got none"
+        return "expected a CUDA device and its driver, got none; install the driver"
     try:
         import torch
     except ImportError:
         return _extras.missing("torch")
     if not torch.cuda.is_available():
         return (
-            "expected a torch that can use the CUDA device, "
-            f"got {torch.__version__}; install one with CUDA"
+            f"expected a version of torch that can use the CUDA device, got {torch.__version__}; "
+            "install torch with CUDA support"
         )
     return None
 
 
 def describe(device: Device) -> str:
-    """Return the kind of a device, on which the last bits of results depend."""
+    """Return the model name of a GPU, or the instruction set of the CPU. The last bits
+    of results depend on it."""
     if not device.is_cuda:
         return _core.isa()
     import torch
@@ -139,8 +142,8 @@ def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Arr
 
 
 def all_like(device: Device) -> list[Device]:
-    """Return a CUDA device and then all others of its kind; for the CPU, only the
-    CPU."""
+    """Return a CUDA device, followed by all others of the same model; for the CPU,
+    return only the CPU."""
     devices = [device]
     if device.is_cuda:
         for number in range(_core.num_cuda_devices()):
@@ -150,8 +153,8 @@ def all_like(device: Device) -> list[Device]:
 
 
 def library_of(array: Array) -> ModuleType:
-    """Return numpy or torch; many functions have the same names and arguments in
-    both."""
+    """Return the module numpy or torch, depending on the type of an array. Many
+    functions have the same names and arguments in both."""
     if isinstance(array, np.ndarray):
         return np
     import torch
@@ -168,8 +171,8 @@ def to_host(array: Array) -> HostArray:
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turn torch's error about too little device memory into MemoryError, which the
-    core raises."""
+    """Convert torch's error for too little device memory to MemoryError, as in the
+    core."""
     try:
         yield
     except RuntimeError as error:
@@ -179,7 +182,8 @@ def memory_errors() -> Iterator[None]:
 
 
 def own_stream(device: Device) -> AbstractContextManager[object]:
-    """Make a device current, and on it a stream that no other thread uses."""
+    """Return a context in which a device is current and uses a stream that no other
+    thread uses."""
     if not device.is_cuda:
         return nullcontext()
     import torch
@@ -189,8 +193,8 @@ def own_stream(device: Device) -> AbstractContextManager[object]:
 
 
 def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], None]:
-    """Return work bound to this thread's stream, so that it uses that stream on any
-    thread."""
+    """Return a function that does the work on the current stream of the calling thread,
+    whichever thread runs the function."""
     if not device.is_cuda:
         return work
     import torch
@@ -205,8 +209,8 @@ def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], N
 
 
 def spare_memory(device: Device) -> None:
-    """Make torch free its cached memory on a device if it is large, because the core
-    cannot use it."""
+    """Make torch release its unused cached memory on a device if it is large, because
+    the core cannot use that memory."""
     if not device.is_cuda:
         return
     import torch

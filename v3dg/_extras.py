@@ -22,16 +22,16 @@ EXTRAS = {
     "fsspec": Extra("fsspec[http]>=2024.2", "files at URLs"),
     "distributed": Extra("distributed>=2024.1", "builds on many machines"),
 }
-"""Optional packages by the names of their modules."""
+"""Optional packages, by the names of their modules."""
 
 
 def missing(module: str) -> str:
-    """Return the message about a package that is not installed, or too old."""
+    """Return the error message for a package that is missing or too old."""
     extra = EXTRAS[module]
     packages = [package for package in EXTRAS.values() if package.purpose == extra.purpose]
     needed = " ".join(f"'{package.requirement}'" for package in packages)
     return (
-        f"{extra.purpose}: expected {extra.requirement}, got none or an older one; "
+        f"{extra.purpose}: expected {extra.requirement}, got no package or an older version; run "
         f"pip install {needed}"
     )
 

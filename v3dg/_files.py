@@ -1,4 +1,4 @@
-"""Files that are either complete or absent, and the first steps of reading untrusted
+"""Writing files that are either complete or absent, and safe access to untrusted
 files."""
 
 import contextlib
@@ -37,11 +37,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
         ValueError: `path` is a device or a pipe.
         OSError: Writing failed; the error names `path`.
     """
-    path = os.fspath(path)  # raises for an integer, which open() would use as a file descriptor
+    # Raises for integers, which open() would accept as file descriptors.
+    path = os.fspath(path)
     status_of_replaced(path)
     folder, name = os.path.split(os.path.realpath(path))
-    # Only the start of the name is used: names are limited to 255 bytes, and a
-    # character has up to four bytes.
+    # The temporary name contains at most 40 characters of the name: names are limited
+    # to 255 bytes, and a character has up to four bytes.
     temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
         # The file is private until it gets the permissions of the file that it
@@ -76,14 +77,15 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
 
 
 def file_mode_mask(status_path: str = "/proc/self/status") -> int:
-    """Return the permissions that this process removes from new files (umask)."""
+    """Return the umask: the permission bits that this process removes from new
+    files."""
     with contextlib.suppress(OSError):
         status = Path(status_path).read_text(encoding="ascii", errors="replace")
         match = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
         if match:
             return int(match[1], 8)
-    # Without /proc, the mask can be read only by setting it. Files that other threads
-    # create meanwhile are private.
+    # Without /proc, the umask can be read only by setting it. Meanwhile, files that
+    # other threads create are private.
     with _MASK_LOCK:
         mask = os.umask(0o077)
         os.umask(mask)
@@ -91,25 +93,29 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
 
 
 def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
-    """Return the status of the file that will be replaced, or None if it does not
-    exist; raises the errors of `replacing`."""
+    """Return the status of the file that will be replaced; None if it does not exist.
+    Raises the errors of `replacing`."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
         return None
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
-    check(path, stat.S_ISREG(status.st_mode), "the path of a file, got a device or a pipe")
-    # Renaming checks only the permissions of the folder; opening the file checks its
-    # own.
+    check(
+        path,
+        stat.S_ISREG(status.st_mode),
+        "the path of a file, got a device or a pipe; choose another path",
+    )
+    # Renaming checks only the permissions of the folder. Opening the file checks the
+    # permissions of the file itself.
     os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
     return status
 
 
 @contextlib.contextmanager
 def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -> Iterator[None]:
-    """Add the name of the file to system errors, which for an open file contain no name
-    or `other_name`."""
+    """Add `path` to system errors that contain no file name, or contain
+    `other_name`."""
     try:
         yield
     except OSError as error:
@@ -120,8 +126,8 @@ def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -
 
 @contextlib.contextmanager
 def value_errors(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
-    """Turn every exception of a library into a ValueError, because no library documents
-    what it raises for damaged content."""
+    """Convert every exception to ValueError, because libraries do not document what
+    they raise for damaged content."""
     try:
         yield
     except MemoryError:
@@ -134,8 +140,8 @@ def value_errors(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
 
 
 def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int) -> None:
-    """Write all data to a file from an offset on, in pieces, so that signals are
-    handled between them."""
+    """Write all data to a file at an offset. The data is written in pieces, so that
+    signals are handled in between."""
     view = memoryview(data)
     while view:
         count = os.pwrite(descriptor, view[:_PIECE_BYTES], offset)
@@ -144,8 +150,8 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
 
 
 def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
-    """Fill an array with bytes of a file from an offset on; return False if the file
-    ends early."""
+    """Fill an array with the bytes of a file at an offset; return False if the file is
+    too short."""
     view = out.reshape(-1).view(np.uint8).data
     while view:
         count = os.preadv(descriptor, [view[:_PIECE_BYTES]], offset)
@@ -157,10 +163,12 @@ def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:
-    """Create the folder of an output, with the folders above it, unless it exists.
+    """Create the folder of an output file and the folders above it, if they do not
+    exist.
 
     Raises:
-        OSError: It cannot be created, such as NotADirectoryError for one below a file.
+        OSError: The folder cannot be created. NotADirectoryError: part of the path is a
+            file.
     """
     folder = Path(path).parent
     try:
@@ -172,8 +180,13 @@ def make_folder(path: str | os.PathLike[str]) -> None:
 
 
 def check_bundle_name(path: str | os.PathLike[str]) -> None:
-    """Raise ValueError for a name that `v3dg.open` would not recognise as a bundle."""
-    check(path, Path(path).suffix == ".v3dg", "a file name ending in .v3dg; v3dg.open needs it")
+    """Raise ValueError for a file name that `v3dg.open` would not recognise as that of
+    a bundle."""
+    check(
+        path,
+        Path(path).suffix == ".v3dg",
+        "a file name ending in .v3dg, by which v3dg.open recognises bundles",
+    )
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:
@@ -184,5 +197,5 @@ def open_regular(path: str | os.PathLike[str]) -> int:
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise ValueError(f"{os.fspath(path)}: expected a file, got a directory or a device")
+        raise ValueError(f"{os.fspath(path)}: expected a file, got a directory, a device or a pipe")
     return descriptor

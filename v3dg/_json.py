@@ -1,4 +1,5 @@
-"""Strict JSON, and values with their location in the file, for error messages."""
+"""Reads and writes strict JSON; values know their location in the file, for error
+messages."""
 
 from __future__ import annotations
 
@@ -21,14 +22,14 @@ Json: TypeAlias = Any
 
 JsonObject: TypeAlias = dict[str, Json]
 
-_LARGEST_SIDE = 1 << 20  # px of a picture
+_LARGEST_SIDE = 1 << 20  # Maximum side of a picture, px.
 _BYTE_ORDER_MARK = "\ufeff"
 _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def parse_json(text: str | bytes) -> Json:
-    """Parse strict JSON, also after a byte order mark: no NaN, no key twice, no
-    unbounded nesting; ValueError otherwise."""
+    """Parse strict JSON, with or without a byte order mark; raise ValueError for
+    invalid JSON, NaN, repeated keys, and deep nesting."""
     if isinstance(text, bytes):
         text = text.decode("utf-8")
     try:
@@ -45,7 +46,7 @@ def _unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
     fields: dict[str, object] = {}
     for key, value in pairs:
         if key in fields:
-            raise ValueError(f"the key {json_text(key)} appears twice")
+            raise ValueError(f"the key {json_text(key)} occurs twice in an object")
         fields[key] = value
     return fields
 
@@ -55,7 +56,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def json_text(value: object) -> str:
-    """Return a JSON value as a short text for a one-line message."""
+    """Return a JSON value as short text for a one-line message."""
     if isinstance(value, dict) and len(value) > 8:
         return f"an object of {len(value)} values"
     if isinstance(value, list) and len(value) > 8:
@@ -63,15 +64,15 @@ def json_text(value: object) -> str:
     try:
         text = json.dumps(value)
     except RecursionError:
-        return "a value that is nested deep"
+        return "a deeply nested value"
     if len(text) > 60:
         return text[:57] + "..."
     return text
 
 
 def is_one_line(text: str) -> bool:
-    """Return whether text can be part of a message: it has no control characters and no
-    unpaired surrogates."""
+    """Return whether a text fits in one line of a message: it has no control characters
+    and no unpaired surrogates."""
     return not any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in text)
 
 
@@ -83,7 +84,7 @@ def read_json(path: str | os.PathLike[str]) -> Node:
         content = file.read()
     try:
         if content.startswith(_UTF16_MARKS):
-            raise ValueError("it is in UTF-16; save it as UTF-8")
+            raise ValueError("the file is in UTF-16; save it as UTF-8")
         return Node(parse_json(content), path.name, "")
     except ValueError as error:
         raise ValueError(
@@ -98,8 +99,8 @@ def write_json(path: str | os.PathLike[str], document: object) -> None:
 
 
 class Node:
-    """A JSON value with its location: the name of the file, and the path in the
-    document."""
+    """A JSON value with its location: the name of the file, and the path of the value
+    in the document."""
 
     def __init__(self, value: Json, file: str, path: str) -> None:
         self.value = value
@@ -117,8 +118,8 @@ class Node:
         return self.problem(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
-        """Return the result of ``make``. Its ValueErrors, which begin with a field, are
-        prefixed with this location."""
+        """Return the result of ``make``. ValueErrors of ``make``, which begin with the
+        name of a field, get the location of this value as a prefix."""
         try:
             return make()
         except ValueError as error:
@@ -128,7 +129,7 @@ class Node:
             raise ValueError(f"{self.file}: {place}{error}") from error
 
     def field(self, key: str) -> Node:
-        """Return one of an object's fields."""
+        """Return a field of an object."""
         if not isinstance(self.value, dict):
             raise self.error("an object")
         if key not in self.value:
@@ -146,20 +147,21 @@ class Node:
     def items(
         self, expected: str = "an array", min_length: int = 0, max_length: float = math.inf
     ) -> Iterator[Node]:
-        """Yield the values of an array; the nodes of a large array together would take
-        far more memory than the file."""
+        """Return an iterator over the values of an array. A list of all nodes of a
+        large array would take far more memory than the file."""
         if not isinstance(self.value, list) or not min_length <= len(self.value) <= max_length:
             raise self.error(expected)
         return (Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value))
 
     def some_fields(self, required: tuple[str, ...]) -> dict[str, Node]:
-        """Return an object's fields; the required ones must be present."""
+        """Return the fields of an object; the required fields must be present."""
         if not isinstance(self.value, dict):
             raise self.error("an object")
         return {key: self.field(key) for key in dict.fromkeys((*required, *self.value))}
 
     def fields(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Node]:
-        """Return an object's fields; unknown ones are an error."""
+        """Return the fields of an object; the required fields must be present, and
+        unknown fields are an error."""
         fields = self.some_fields(required)
         for key, node in fields.items():
             if key not in required and key not in optional:
@@ -198,8 +200,8 @@ class Node:
         return self.number("radians between 0 and pi", 0, math.pi)
 
     def size(self) -> int:
-        """Return the side of a picture in px; 1920.0 is accepted, too, because some
-        programs write that."""
+        """Return the side of a picture in px. Values such as 1920.0 are accepted,
+        because some programs write them."""
         side = self.number()
         if side != int(side) or side <= 0:
             raise self.error("a positive whole number")

@@ -1,5 +1,4 @@
-"""Measurements of many pictures, each in a separate process, and means of the
-results."""
+"""Measures many pictures in separate processes, and averages the results."""
 
 import contextlib
 import multiprocessing
@@ -21,25 +20,26 @@ R = TypeVar("R")
 
 
 class _Judge(NamedTuple):
-    """A measuring process, and this process's end of the pipe to it."""
+    """A measuring process, and the end of its pipe in this process."""
 
     process: SpawnProcess
     pipe: Connection
 
 
 class Judges:
-    """Processes that measure items: each starts when it is first needed, and ends at
-    `close`."""
+    """Processes that measure items. Each process is started when it is first needed,
+    and ended by `close`."""
 
     def __init__(self) -> None:
         self._cores = len(os.sched_getaffinity(0))
         self._judges: list[_Judge] = []
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
-        """Yield items with the result of ``measure`` for each, in order; later items
-        are produced meanwhile.
+        """Yield each item with the result of ``measure`` for it, in order. Later items
+        are produced while earlier ones are measured.
 
-        ``measure`` must be a function of a module, because other processes import it.
+        ``measure`` must be defined at the top level of a module, because other
+        processes import it.
         """
         waiting: deque[tuple[T, Connection]] = deque()
         try:
@@ -54,19 +54,19 @@ class Judges:
                 measured_item, pipe = waiting.popleft()
                 yield measured_item, cast(R, _answer(pipe))
         except BaseException:
-            # Answers that are still pending would be mistaken for those of later items.
+            # Results that are still pending would be taken for those of later items.
             self.close()
             raise
 
     def _pipe(self, number: int) -> Connection:
-        """Return the pipe to a process, which is started if it does not run yet."""
+        """Return the pipe to a process; start the process if it is not running yet."""
         if number == len(self._judges):
-            resource_tracker.ensure_running()  # starting it unblocks signals
-            # Only this process handles Ctrl-C: a starting process must not be
+            resource_tracker.ensure_running()  # starting the tracker unblocks signals
+            # Only the parent process handles Ctrl-C. A new process must not be
             # interrupted before it can ignore the signal.
             previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
-                # A forked process would inherit CUDA and OpenMP in an unusable state.
+                # CUDA and OpenMP do not work in a forked process.
                 context = multiprocessing.get_context("spawn")
                 pipe, pipe_of_judge = context.Pipe()
                 process = context.Process(target=_judge, args=(pipe_of_judge,), daemon=True)
@@ -86,7 +86,7 @@ class Judges:
 
 
 def _judge(pipe: Connection) -> None:
-    """Measure the items that arrive until the other end of the pipe is closed."""
+    """Measure the items that arrive, until the other end of the pipe is closed."""
     with contextlib.suppress(EOFError, OSError):
         while True:
             measure, item = pipe.recv()
@@ -102,15 +102,17 @@ def _answer(pipe: Connection) -> object:
     try:
         result, error = pipe.recv()
     except (EOFError, ConnectionError):
-        raise RuntimeError("a worker that measures pictures was killed") from None
+        raise RuntimeError(
+            "a worker that measures pictures was killed; try again with more free memory"
+        ) from None
     if error is not None:
         raise error
     return result
 
 
 def mean_of(rows: Sequence[Mapping[str, float | None]], *names: str) -> JsonObject:
-    """Return the mean of each column, to six significant digits; a column without
-    values has the mean None."""
+    """Return the mean of each column, rounded to six significant digits; None for a
+    column without values."""
     means: dict[str, float | None] = {}
     for name in names:
         values = [value for row in rows if (value := row.get(name)) is not None]

@@ -1,5 +1,5 @@
-"""Checks of numbers from users; errors are one line and contain the name of the
-number."""
+"""Checks of numbers from users. Errors are one line that begins with the name of the
+argument."""
 
 import math
 import operator
@@ -28,8 +28,8 @@ class _Tensor(Protocol):
 
 
 def floats(values: object, name: str, expected: str = "numbers") -> Floats:
-    """Return a new array of doubles, from numbers, arrays or torch tensors; raise
-    ValueError unless all are finite."""
+    """Return numbers, an array or a torch tensor as a new array of doubles; raise
+    ValueError unless all values are finite."""
     try:
         if hasattr(values, "detach"):
             array = np.asarray(cast(_Tensor, values).numpy(force=True))
@@ -62,7 +62,7 @@ def vector(values: object, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
         and values.dtype == np.float64
         and math.isfinite(sum(values.ravel().tolist()))
     ):
-        return np.array(values, order="C")  # the fast path, which is used in every frame
+        return np.array(values, order="C")  # fast path for calls in every frame
     array = floats(values, name, f"numbers of shape {shape}")
     check(name, array.shape == shape, f"shape {shape}, got {array.shape}")
     return array
@@ -75,7 +75,7 @@ def color(values: object, name: str) -> list[float]:
         and len(values) == 3
         and all(type(v) is float and 0 <= v <= 1 for v in values)
     ):
-        return list(values)  # the fast path, which is used in every frame
+        return list(values)  # fast path for calls in every frame
     array = vector(values, name)
     largest = np.abs(array).max()
     check(name, largest <= MOST_FLOAT, f"numbers that a float32 can hold, got {largest}")
@@ -142,18 +142,18 @@ def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
 
 
 def refuse(name: str | os.PathLike[str], expected: str) -> NoReturn:
-    """Raise the ValueError of `check`; for callers that compose the message only if it
-    is needed."""
+    """Raise the ValueError of `check`. Use this function where composing the message is
+    slow."""
     raise ValueError(f"{os.fspath(name)}: expected {expected}")
 
 
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
-    """Raise TypeError unless a value is an instance of ``kind``; messages call it
-    ``expected``."""
+    """Raise TypeError unless a value is an instance of ``kind``. Messages call that
+    type ``expected``."""
     if not isinstance(value, kind):
         advice = ""
         if isinstance(value, str | os.PathLike) and kind.__name__ == "Camera":
-            advice = "; v3dg.read_cameras reads files"
+            advice = "; v3dg.read_cameras reads camera files"
         raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}{advice}")
 
 
@@ -165,7 +165,8 @@ def check_all(
 ) -> None:
     """Raise ValueError for the first row that is invalid.
 
-    ``expected`` is a text, or a function that returns one for the number of the row.
+    ``expected`` is a text, or a function that returns the text for the index of the
+    row.
     """
     if not good.all():
         row = int(np.argmin(good.reshape(len(good), -1).all(1)))
@@ -175,7 +176,7 @@ def check_all(
 
 
 def one_of(value: object, name: str, choices: tuple[str, ...]) -> None:
-    """Raise ValueError unless ``value`` is one of the texts ``choices``."""
+    """Raise ValueError unless ``value`` is one of the strings in ``choices``."""
     if not (isinstance(value, str) and value in choices):
         refuse(name, f"{' or '.join(map(repr, choices))}, got {value_text(value)}")
 

@@ -1,5 +1,5 @@
-"""Progress of long work: a bar in a terminal, a few lines in a log, or calls of a
-function."""
+"""Shows the progress of long work: as a bar in a terminal, as a few lines in a log, or
+by calls of a function."""
 
 import contextlib
 import logging
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Progress: TypeAlias = bool | Callable[[int, int, str], object]
-"""Whether to show progress; or a function that is called with the work done, the total,
-and a text."""
+"""Whether to show progress; or a function that is called with the amount of finished
+work, the total, and a text."""
 
 _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())
 _LINES = 4  # number of log lines for one piece of work
 _LEAST_SCALED = 10_000  # from this total on, a bar counts in thousands and millions
-_PATIENCE_SECONDS = 2.0  # work that is done by then shows nothing
+_PATIENCE_SECONDS = 2.0  # Shorter work shows nothing.
 
 
 class Bar:
-    """The display of how much of a total is done.
+    """A display of finished work as a part of a total.
 
     Raises:
         TypeError: ``progress`` is neither a boolean nor a function.
@@ -88,7 +88,7 @@ class Bar:
 
 
 def counted(items: Iterable[T], total: int, name: str, progress: Progress) -> Iterator[T]:
-    """Yield the items; each counts as done when the next one is requested."""
+    """Yield the items. An item counts as finished when the next one is requested."""
     with Bar(total, name, progress) as bar:
         for item in items:
             yield item
@@ -97,8 +97,8 @@ def counted(items: Iterable[T], total: int, name: str, progress: Progress) -> It
 
 @contextlib.contextmanager
 def waiting(text: str, *, show: bool) -> Iterator[None]:
-    """Show that work of an unknown amount goes on, from two seconds on: the seconds
-    that it has taken in a terminal, elsewhere one line."""
+    """Show that work of unknown duration is in progress, if it takes more than two
+    seconds. A terminal shows the elapsed seconds; a log gets one line."""
     if not show:
         yield
         return
@@ -124,6 +124,6 @@ def _show_waiting(text: str, is_done: threading.Event) -> None:
         seconds = time.monotonic() - start
         print(f"\r{text} ... {seconds:.0f} s", end="", file=sys.stderr, flush=True)
         if is_done.wait(1.0):
-            # Erases the line.
+            # Erase the line.
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
             return

@@ -1,10 +1,10 @@
-"""The start of a process that runs a command: it opens closed streams, and handles
+"""Prepares a process that runs a command: reopens closed standard streams, and handles
 Ctrl-C.
 
 Ctrl-C, once or repeatedly, ends the process with one line. The package imports this
-module before everything that takes long, so the module itself imports almost nothing.
-Before a command runs there is nothing to clean up, and Ctrl-C ends the process at once;
-from then on it raises KeyboardInterrupt.
+module before modules that take long to import, so the module itself imports almost
+nothing. Until a command runs, nothing needs to be cleaned up, and Ctrl-C ends the
+process at once. While a command runs, Ctrl-C raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ for example during an import."""
 
 
 def refuse_sub_interpreter() -> None:
-    """Raise ImportError in an interpreter that is not the main one of its process.
+    """Raise ImportError in a sub-interpreter.
 
-    The compiled module and NumPy support only one interpreter; in others, loading them
-    would wait forever.
+    The compiled module and NumPy support only the main interpreter of a process.
+    Importing them in another one would wait forever.
     """
-    for name in ("_interpreters", "_xxsubinterpreters"):  # since Python 3.13, and before
+    # Name since Python 3.13, and name before.
+    for name in ("_interpreters", "_xxsubinterpreters"):
         try:
             interpreters = importlib.import_module(name)
         except ImportError:
@@ -40,29 +41,33 @@ def refuse_sub_interpreter() -> None:
         if interpreters.get_current() != interpreters.get_main():
             raise ImportError(
                 "v3dg: expected the main interpreter of a process, got a sub-interpreter; use a "
-                "process"
+                "separate process"
             )
         return
 
 
 def begin() -> None:
-    """Open closed streams on the null device, and make Ctrl-C end the process."""
-    # This is skipped if the parent process ignores Ctrl-C.
+    """Open closed standard streams on the null device, and make Ctrl-C end the
+    process."""
+    # If the parent process ignores Ctrl-C, this process ignores it, too.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_at_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass  # otherwise a file would get the number of a stream, and everything that is printed
+        # A later file must not get the descriptor of a standard stream and all output
+        # with it.
+        pass
     os.close(descriptor)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        # Characters that an encoding lacks are escaped.
+        # Characters that the encoding lacks are printed as escapes.
         getattr(sys, name).reconfigure(errors="backslashreplace")
 
 
 def _end_at_once(number: int, frame: types.FrameType | None) -> None:
-    signal.signal(signal.SIGINT, lambda *_: None)  # further interrupts must not print a second line
+    # Further interrupts must not print a second line.
+    signal.signal(signal.SIGINT, lambda *_: None)
     try:
         os.write(2, b"v3dg: error: interrupted\n")
     finally:
@@ -70,8 +75,8 @@ def _end_at_once(number: int, frame: types.FrameType | None) -> None:
 
 
 def raise_interrupts() -> None:
-    """Make Ctrl-C raise KeyboardInterrupt from now on, if it ended the process at once
-    so far."""
+    """Make Ctrl-C raise KeyboardInterrupt from now on, if so far it ended the process
+    at once."""
     if signal.getsignal(signal.SIGINT) is _end_at_once:
         interrupts = _Interrupts()
         for number in reversed(SIGNALS):
@@ -84,8 +89,8 @@ class _Interrupt(KeyboardInterrupt):
 
 
 class _Interrupts:
-    """Raises one interrupt, and no other while it propagates, so that cleaning up is
-    not interrupted."""
+    """Raises at most one interrupt at a time, so that a second Ctrl-C does not
+    interrupt the cleaning up after the first one."""
 
     def __init__(self) -> None:
         import weakref
@@ -94,23 +99,24 @@ class _Interrupts:
         self._raised: weakref.ref[_Interrupt] | None = None
 
     def handle(self, number: int, frame: types.FrameType | None) -> None:
-        # The interrupt is postponed during an import, which would leave an incomplete
-        # module, and while this thread blocks Ctrl-C, if another thread has received
-        # it.
+        # The interrupt is postponed in two cases: during an import, which would leave
+        # an incomplete module, and while this thread blocks Ctrl-C but another thread
+        # has received the signal.
         if _is_importing(frame) or signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()):
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
         elif self._raised is None or self._raised() is None:
             raise self._interrupt()
 
     def _interrupt(self) -> _Interrupt:
-        # The exception is not created in `handle`: it would refer to a frame that
-        # refers to it, and stay alive.
+        # The exception is created here and not in `handle`. Otherwise it and the frame
+        # of `handle` would refer to each other and stay alive.
         interrupt = _Interrupt()
         self._raised = self._refer(interrupt)
         return interrupt
 
     def unraisable(self, arguments: sys.UnraisableHookArgs) -> None:
-        """Raise an interrupt again that a destructor or a callback has swallowed."""
+        """Schedule an interrupt again that was swallowed by a destructor or a
+        callback."""
         if isinstance(arguments.exc_value, _Interrupt):
             self._raised = None
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
@@ -127,7 +133,8 @@ def _is_importing(frame: types.FrameType | None) -> bool:
 
 
 refuse_sub_interpreter()
-# The program's name precedes the arguments; an interactive process has none.
+# The name of the program is before the arguments; an interactive process has no such
+# name.
 if [os.path.basename(name) for name in sys.orig_argv[-len(sys.argv) :][:1]] in (
     ["v3dg"],
     ["-mv3dg"],

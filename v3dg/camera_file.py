@@ -1,6 +1,7 @@
-"""Camera files: the `transforms.json` of nerfstudio, instant-ngp and NeRF's synthetic
-scenes, `cameras.json` of the code of the 3DGS paper, paths of nerfstudio's viewer, and
-models of COLMAP; and folders with one of them, and runs of nerfstudio."""
+"""Reads and writes camera files: `transforms.json` of nerfstudio, instant-ngp and
+NeRF's synthetic scenes, `cameras.json` of the code of the 3DGS paper, camera paths of
+nerfstudio's viewer, and models of COLMAP. Also reads folders with such a file, and runs
+of nerfstudio."""
 
 import math
 import os
@@ -36,20 +37,21 @@ _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 # The coefficients in a file of nerfstudio. Its k4 of a pinhole is not that of OpenCV,
 # but the factor of r⁸.
 _PINHOLE_TERMS = ("k1", "k2", "p1", "p2", "k3")
-_MOST_NAMED = 8  # images in a warning
-_RUN = "config.yml"  # identifies a run of nerfstudio
-_TRAINING = "dataparser_transforms.json"  # from a run's data to its training
+_MOST_NAMED = 8  # number of images that a warning lists
+_RUN = "config.yml"  # a folder with this file is a run of nerfstudio
+# Transform from the data of a run to its training.
+_TRAINING = "dataparser_transforms.json"
 _FRAMES = ("transforms.json", "transforms_train.json")
 _DATA = re.compile(
     r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE
 )
-# Rotation from a camera with x right, y up, z backward to one with x right, y down, z
-# forward.
+# Rotation from camera axes x right, y up, z backward to x right, y down, z forward.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 class CameraWarning(UserWarning):
-    """Cameras of a file were left out because their numbers are not finite."""
+    """Emitted when cameras of a file are skipped because their numbers are not
+    finite."""
 
 
 def read_cameras(
@@ -67,30 +69,31 @@ def read_cameras(
     - the `cameras.json` that the code of the 3DGS paper writes;
     - a `camera_path.json` of nerfstudio's viewer, whose frames are named by their
       number unless they have a `file_path`;
-    - a folder with one of these files: where `dataparser_transforms.json` is beside a
-      `transforms.json`, cameras are in the frame of that training;
-    - a model of COLMAP, binary or text, by its folder or its `images` file, whose
-      cameras are named after their images;
+    - a folder with one of these files. If it contains `dataparser_transforms.json`
+      beside `transforms.json`, cameras are in the frame of that training;
+    - the folder or the `images` file of a COLMAP model, binary or text, whose cameras
+      are named after their images;
     - the folder of a run of nerfstudio, or its `config.yml`, whose cameras are in the
       frame of the training.
 
-    A camera is named by its `file_path`, its image, or `img_name`; if any is missing or
-    repeats, all are named by their number, from 0. Pictures, depths, masks and point
-    clouds that the file names are not read. Images of a COLMAP model whose pose or lens
-    has numbers that are not finite are left out, with a `CameraWarning`.
+    A camera is named by its `file_path`, its image, or `img_name`. If a name is missing
+    or occurs twice, all cameras are named by their number, from 0. Pictures, depths,
+    masks and point clouds that the file refers to are not read. Images of a COLMAP
+    model whose pose or lens is not finite are skipped with a `CameraWarning`.
 
     Args:
         size: Width and height in px for a file that has neither `w` and `h` nor focal
             lengths in px.
-        distortion: Whether cameras have the lens distortion of the file, or it is left
-            out and they are pinholes; a fisheye is an error then.
-        applied_transform: Whether cameras stay in the frame of the file, or
-            `applied_transform` and `applied_scale` are undone, for assets in the frame
-            that the data had before.
+        distortion: "draw" returns cameras with the lens distortion of the file;
+            "ignore" returns pinhole cameras without it, and raises an error for a
+            fisheye.
+        applied_transform: "keep" leaves cameras in the frame of the file. "undo"
+            inverts the file's `applied_transform` and `applied_scale`, for assets in
+            the original frame of the data.
 
     Raises:
-        ValueError: The content is not valid, or has cameras of another model than those
-            of `Camera`; the message names the place in it.
+        ValueError: The content is invalid or has cameras of another model than those of
+            `Camera`; the message names the place in the file.
         OSError: The file cannot be read.
     """
     one_of(distortion, "distortion", ("draw", "ignore"))
@@ -121,14 +124,15 @@ def read_cameras(
 
 
 class _Place(NamedTuple):
-    """The file that has the cameras, and that of the training whose frame they get."""
+    """The file with the cameras, and the file with the transform to the frame of a
+    training; None for the frame of the cameras' file."""
 
     file: Path
     training: Path | None = None
 
 
 def _place_of(path: Path) -> _Place:
-    """Return where the cameras of a file, a folder or a run of nerfstudio are."""
+    """Return the camera file for a file, a folder or a run of nerfstudio."""
     folder = path
     if path.name == _RUN:
         folder = path.parent
@@ -146,8 +150,8 @@ def _place_of(path: Path) -> _Place:
 
 
 def _named(pairs: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
-    """Return cameras by name, or by number if a name is empty or repeats, so that none
-    replaces another."""
+    """Return cameras by name. If a name is empty or occurs twice, all are named by
+    their number, so that no camera replaces another."""
     names = []
     cameras = []
     for name, camera in pairs:
@@ -159,7 +163,8 @@ def _named(pairs: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
 
 
 def _file_in(folder: Path) -> Path:
-    """Return the camera file in a folder: one of a COLMAP model, or a JSON file."""
+    """Return the camera file in a folder: the `images` file of a COLMAP model, or a
+    JSON file."""
     places = [folder / part for part in ("", "sparse/0", "sparse", "0")]
     files = [place / name for place in places for name in IMAGE_FILES]
     files += [folder / name for name in (*_FRAMES, "cameras.json", "camera_path.json")]
@@ -168,29 +173,29 @@ def _file_in(folder: Path) -> Path:
         "a model of COLMAP (images.bin or images.txt), a run of nerfstudio (config.yml), "
         "transforms.json, cameras.json or camera_path.json"
     )
-    check(folder, existing, f"{expected}, got a folder without")
+    check(folder, existing, f"{expected}, got a folder with none of them")
     return existing[0]
 
 
 def _frames_at_top(document: Node) -> dict[str, Node]:
-    """Return the fields of a file with frames; the ValueError for another file says
-    what it is."""
+    """Return the fields of a file with frames; raise a ValueError that describes any
+    other file."""
     if document.has("keyframes") or document.has("camera_path"):
-        advice = "save the path in nerfstudio's viewer, which then writes them, too"
+        advice = "save the path in nerfstudio's viewer, which then writes its frames, too"
         raise document.problem(f"expected frames in camera_path, got none; {advice}")
     if document.has("transform") and document.has("scale"):
-        advice = "give the folder of the run, or put it beside transforms.json"
+        advice = "give the folder of the run, or put this file beside transforms.json"
         raise document.problem(f"expected cameras, got the transform of a run's training; {advice}")
     return document.some_fields(("frames",))
 
 
 def _read_3dgs(node: Node) -> tuple[str, Camera]:
-    """Return a camera of the `cameras.json` that the code of the 3DGS paper writes. Its
-    rotation and position take camera to world; x is right, y down, z forward."""
+    """Return a camera of the `cameras.json` that the code of the 3DGS paper writes.
+    Rotation and position are from camera to world; x is right, y down, z forward."""
     if node.has("transform"):
         raise node.problem(
-            "expected position, rotation, fx and fy, got a pose alone, as ns-export cameras "
-            "writes it; give the folder of the run"
+            "expected position, rotation, fx and fy, got only a pose, as written by ns-export "
+            "cameras; give the folder of the run"
         )
     required = ("position", "rotation", "fx", "fy", "width", "height")
     fields = node.some_fields(required)
@@ -209,8 +214,8 @@ def _read_3dgs(node: Node) -> tuple[str, Camera]:
 
 def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[str, Camera]]:
     """Yield the frames of a camera path of nerfstudio's viewer, named by `file_path` or
-    else by their number. Matrices take camera to world, with x right, y up, z backward;
-    `fov` is the vertical field of view in degrees, and pixels are square."""
+    else by their number. Matrices are from camera to world, with x right, y up, z
+    backward. `fov` is the vertical field of view in degrees; pixels are square."""
     for key in ("camera_type", "camera_model"):
         if document.has(key) and document.field(key).text() != "perspective":
             raise document.field(key).error('"perspective"')
@@ -218,7 +223,9 @@ def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[s
         width = document.field("render_width").size()
         height = document.field("render_height").size()
     elif size is None:
-        raise document.problem("expected render_width and render_height; give the size")
+        raise document.problem(
+            "expected render_width and render_height, got neither; pass the size of the pictures"
+        )
     else:
         width, height = size
     for number, node in enumerate(document.field("camera_path").items()):
@@ -234,7 +241,7 @@ def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[s
 
 
 def _flat_or_rows(node: Node) -> Floats:
-    """Return a (4, 4) matrix that is given as 16 numbers, row by row, or as four
+    """Return a (4, 4) matrix that the file stores as 16 numbers, row by row, or as four
     rows."""
     if isinstance(node.value, list) and len(node.value) == 16:
         matrix = np.array(node.vector(16)).reshape(4, 4)
@@ -251,7 +258,7 @@ def _read_frame(
     size: tuple[int, int] | None,
     distortion: str,
 ) -> Camera:
-    """Return the camera of a frame; fields that the frame lacks are read from the top
+    """Return the camera of a frame. Fields that the frame lacks are taken from the top
     of the file."""
     fields = {**top, **frame}
     lens_model, coefficients = _lens(fields, distortion)
@@ -263,17 +270,19 @@ def _read_frame(
     if "near" in fields:
         near = fields["near"].positive()
     viewmat = node.attempt(partial(viewmat_from_blender, _rows(fields["transform_matrix"])))
-    for transform, scale in transforms:  # each leads back to the world before it was applied
-        # Camera refuses values that are not finite.
+    # Each transform leads back to the world before it was applied.
+    for transform, scale in transforms:
+        # Camera rejects values that are not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             viewmat = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
-            viewmat[:3] /= scale  # the camera keeps a scale of 1
+            viewmat[:3] /= scale  # the camera's rotation must have scale 1
     return node.attempt(partial(Camera, viewmat, K, width, height, near, coefficients, lens_model))
 
 
 def _data_of(run: Path) -> Path:
-    """Return the `transforms.json` of the data that a nerfstudio run was trained on."""
-    # YAML with Python objects, of which only a path is read.
+    """Return the `transforms.json` of the data that a run of nerfstudio was trained
+    on."""
+    # The YAML contains Python objects, so only the path is extracted.
     text = (run / _RUN).read_text(encoding="utf-8", errors="replace")
     files = []
     for entry in _DATA.findall(text):
@@ -287,15 +296,15 @@ def _data_of(run: Path) -> Path:
     existing = next((file for file in files if file.is_file()), None)
     if existing is None:
         tried = (
-            " or ".join(map(str, dict.fromkeys(files))) or "a path under data:, which it has not"
+            " or ".join(map(str, dict.fromkeys(files))) or "a path under data:, which is missing"
         )
-        refuse(run / _RUN, f"the run's data at {tried}, got none; put it there")
+        refuse(run / _RUN, f"the data of the run at {tried}, got no file there; put it there")
     return existing
 
 
 def _trained(file: Path) -> tuple[Floats, float]:
-    """Return the transform from the frame of a run's training to that of its data, as
-    `_applied` returns it."""
+    """Return the transform from the frame of a run's training to that of its data, in
+    the form of `_applied`."""
     top = read_json(file).some_fields(("transform", "scale"))
     matrix = _rows(top["transform"])
     scale = top["scale"].positive()
@@ -312,11 +321,11 @@ def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
     if len(finite) < len(model):
         names = [image.name for image in model if not image.is_finite]
         text = f"{len(names)} of {len(model)} images have cameras whose numbers are not finite"
-        check(images, finite, f"an image with finite numbers, got none: {text}")
+        check(images, finite, f"at least one image with finite numbers, got none: {text}")
         shown_names = ", ".join(names[:_MOST_NAMED])
         if len(names) > _MOST_NAMED:
             shown_names += f" and {len(names) - _MOST_NAMED} more"
-        text += f" and are left out: {shown_names}"
+        text += f"and are skipped: {shown_names}"
         warnings.warn(f"{images}: {text}", CameraWarning, stacklevel=3)
     named = []
     for image in finite:
@@ -349,8 +358,8 @@ def _camera_of(image: Image, place: str, distortion: str) -> Camera:
 
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:
-    """Write named cameras as a nerfstudio `transforms.json`; `read_cameras` gives the
-    same cameras."""
+    """Write named cameras as a nerfstudio `transforms.json`, from which `read_cameras`
+    returns the same cameras."""
     check_cameras(cameras)
     frames = []
     for name, camera in cameras.items():
@@ -431,8 +440,8 @@ def _term(fields: Mapping[str, Node], name: str) -> float:
 
 
 def _rows(node: Node) -> Floats:
-    """Return a matrix that is given as 3 or 4 rows as (4, 4); a fourth row is ignored,
-    as other readers do."""
+    """Return a (4, 4) matrix that the file stores as 3 or 4 rows. Like in other
+    readers, a fourth row is ignored."""
     num_rows = 4
     if isinstance(node.value, list) and len(node.value) == 3:
         num_rows = 3
@@ -442,8 +451,8 @@ def _rows(node: Node) -> Floats:
 
 
 def _applied(top: Mapping[str, Node]) -> tuple[Floats, float]:
-    """Return the (4, 4) rotation and translation, then the scale, that were applied to
-    the file's positions."""
+    """Return the transform that was applied to the file's positions: a (4, 4) rotation
+    and translation, followed by a scale."""
     transform: Floats = np.eye(4)
     if "applied_transform" in top:
         transform = _rows(top["applied_transform"])
@@ -458,17 +467,18 @@ def _applied(top: Mapping[str, Node]) -> tuple[Floats, float]:
 def _intrinsics(
     frame: Node, fields: Mapping[str, Node], focal: Mapping[str, Node], size: tuple[int, int] | None
 ) -> tuple[Floats, int, int]:
-    """K, width and height."""
+    """Return K, the width and the height."""
     if "w" in fields and "h" in fields:
         width = fields["w"].size()
         height = fields["h"].size()
     elif "fl_x" in focal:
         raise frame.problem(
-            "expected w and h, in the frame or at the top, got focal lengths in px and no size"
+            "expected w and h, in the frame or at the top, got focal lengths in px without a size"
         )
     elif size is None:
         raise frame.problem(
-            "expected w and h, in the frame or at the top, got neither; give the size"
+            "expected w and h, in the frame or at the top, got neither; pass the size of the "
+            "pictures"
         )
     else:
         width, height = size

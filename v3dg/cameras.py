@@ -1,5 +1,5 @@
-"""Cameras, pinholes or with lens distortion: made from matrices, from two points, from
-Blender's convention, or on a turntable."""
+"""Cameras, pinholes or with lens distortion: made from matrices, from two points, or
+from Blender's convention, and series of cameras on a turntable."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,8 +33,8 @@ _NUM_COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
 }
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
-# The near plane as a share of the distance to the subject, and its bounds in world
-# units; float32 holds the inverse of the smaller one.
+# The near plane as a fraction of the distance to the subject, and its bounds in world
+# units. Float32 can represent the inverse of the smaller bound.
 _NEAR_SHARE = 0.01
 _MOST_NEAR = 0.01
 _LEAST_NEAR = 1e-30
@@ -48,8 +48,8 @@ ROTATION_TOLERANCE = 1e-4
 class Camera:
     """Camera in the OpenCV convention: x right, y down, z forward.
 
-    Pixel (i, j) has its centre at (i + ½, j + ½). Matrices are copied, in double
-    precision.
+    Pixel (i, j) has its centre at (i + ½, j + ½). Matrices are copied and converted to
+    double precision.
 
     The models are those of OpenCV's documentation of camera calibration. Points beyond
     the first fold of a lens, where its image would turn back, are not drawn.
@@ -59,7 +59,8 @@ class Camera:
         K: (3, 3) focal lengths and principal point in px, without skew.
         width: Image width in px.
         height: Image height in px.
-        near: Gaussians whose mean lies nearer than this depth are not drawn; > 0.
+        near: Gaussians whose mean has a smaller depth than this are not drawn; world
+            units, > 0.
         distortion: Coefficients of the model in OpenCV's order: for "OPENCV" k1, k2,
             p1, p2, or these and k3, or these and k3 to k6; for "OPENCV_FISHEYE" k1 to
             k4; none for "PINHOLE".
@@ -90,7 +91,7 @@ class Camera:
         if viewmat[3].tolist() != [0, 0, 0, 1]:
             refuse("viewmat", f"the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
-        # Python numbers, because NumPy is slower for 9 or 16 of them, and every frame
+        # These are Python numbers: for so few values, NumPy is slower, and every frame
         # may have a new camera.
         (fx, skew, cx), (skew_y, fy, cy), last_row = K.tolist()
         if not (fx > 0 and fy > 0):
@@ -134,8 +135,8 @@ class Camera:
             target: (3,) point in the world, not at the eye.
             up: (3,) direction in the world, not along the view.
             fov_x: Horizontal field of view in radians; pixels are square.
-            near: See `Camera`; None is a hundredth of the distance to the target, and
-                at most 0.01, so that small subjects are seen from near, too.
+            near: See `Camera`. None means a hundredth of the distance to the target,
+                but at most 0.01, so that small subjects can be seen from near.
 
         Raises:
             ValueError: The target is at the eye, or ``up`` lies along the view
@@ -153,7 +154,7 @@ class Camera:
             f"points whose distance a double can hold, got {_text(position)} and {_text(goal)}",
         )
         forward = (goal - position) / distance
-        # Squares neither overflow nor underflow.
+        # Scaled to at most 1, so that squares neither overflow nor underflow.
         upwards = up_vector / (np.abs(up_vector).max() or 1.0)
         right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
@@ -184,8 +185,8 @@ class Camera:
         y up, z backward.
 
         Args:
-            transform_matrix: (4, 4) camera to world; it is replaced by the nearest
-                rotation.
+            transform_matrix: (4, 4) camera to world; its rotation is replaced by the
+                nearest exact rotation.
             fov_x: Horizontal field of view in radians.
             fov_y: Vertical field of view in radians; square pixels if None.
         """
@@ -194,7 +195,7 @@ class Camera:
 
     @property
     def position(self) -> Floats:
-        """(3,) the eye in the world."""
+        """(3,) position of the camera in the world."""
         return self.core.position
 
     @cached_property
@@ -276,8 +277,8 @@ class StereoCamera:
     def __post_init__(self) -> None:
         has_same_rotation = np.array_equal(self.left.viewmat[:3, :3], self.right.viewmat[:3, :3])
         expected = (
-            "a camera of the same rotation as the left one, got another; "
-            "draw such cameras one by one"
+            "a camera of the same rotation as the left one, got another; draw cameras with "
+            "different rotations one by one"
         )
         check("right", has_same_rotation, expected)
         for name, camera in (("left", self.left), ("right", self.right)):
@@ -285,8 +286,8 @@ class StereoCamera:
 
     @classmethod
     def of(cls, camera: Camera, eye_distance: float) -> "StereoCamera":
-        """Return eyes to the left and the right of a camera, ``eye_distance`` world
-        units apart."""
+        """Return two cameras to the left and the right of a camera, ``eye_distance``
+        world units apart."""
         shift = np.zeros((4, 4))
         shift[0, 3] = 0.5 * positive(eye_distance, "eye_distance")
         left = replace(camera, viewmat=camera.viewmat + shift)
@@ -316,8 +317,8 @@ def for_each(
     camera: Camera | StereoCamera | Sequence[Camera],
     make: Callable[[Camera | StereoCamera], T],
 ) -> T | list[T]:
-    """Return the result of ``make`` for one camera, or a list of its results for
-    several."""
+    """Return the result of ``make`` for one camera, or a list of the results for
+    several cameras."""
     if hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0:
         return [make(view) for view in cast(Iterable[Camera], camera)]
     return make(cast(Camera, camera))
@@ -330,7 +331,9 @@ def check_pinhole(name: str, camera: Camera, advice: str) -> None:
 
 def check_cameras(cameras: object) -> None:
     """Raise TypeError unless ``cameras`` is a mapping from names to cameras."""
-    check_type("cameras", cameras, Mapping, "cameras by their names, as {'front': camera}")
+    check_type(
+        "cameras", cameras, Mapping, "a mapping from names to cameras, such as {'front': camera}"
+    )
     assert isinstance(cameras, Mapping)
     for name, camera in cameras.items():
         check_type(f"cameras[{name!r}]", camera, Camera, "a Camera")
@@ -370,10 +373,10 @@ def turntable(
     elevation = real(elevation, "elevation")
     if not abs(elevation) < math.pi / 2:
         refuse("elevation", f"an angle between -pi/2 and pi/2, got {elevation}")
-    check("up", axis.any(), f"a direction, got {_text(axis)}")
+    check("up", axis.any(), f"a direction other than zero, got {_text(axis)}")
     axis /= np.abs(axis).max()  # squares neither overflow nor underflow
     axis /= np.linalg.norm(axis)
-    # The world's axis with the largest angle to `up`, made perpendicular to it.
+    # The coordinate axis with the largest angle to `up`, made perpendicular to `up`.
     start = np.eye(3)[np.argmin(np.abs(axis))]
     start = start - axis * (axis @ start)
     start /= np.linalg.norm(start)
@@ -395,11 +398,12 @@ def near_of(distance: float) -> float:
 
 
 def rigid(rotation: Floats, eye: Floats) -> Floats:
-    """Return the (4, 4) matrix from world to camera, given its rotation and the
-    position of the eye."""
+    """Return the (4, 4) matrix from world to camera, given the rotation and the
+    position of the camera."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
-    with np.errstate(over="ignore", invalid="ignore"):  # Camera refuses values that are not finite
+    # Overflow is found later, by Camera.
+    with np.errstate(over="ignore", invalid="ignore"):
         viewmat[:3, 3] = -rotation @ eye
     return viewmat
 
@@ -407,7 +411,8 @@ def rigid(rotation: Floats, eye: Floats) -> Floats:
 def is_rotation(matrix: Floats) -> bool:
     """Return whether a (3, 3) matrix is a rotation, up to the rounding of float32
     text."""
-    # Written out in Python numbers: every frame of a flight checks a new camera.
+    # Python numbers are faster here than NumPy, and every frame of a flight checks a
+    # new camera.
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     deviation: float = max(
         abs(a * a + b * b + c * c - 1),
@@ -427,8 +432,8 @@ def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
 
 
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
-    """Convert a (4, 4) matrix from camera to world in Blender's convention into one
-    from world to camera, with the nearest rotation."""
+    """Convert a (4, 4) camera-to-world matrix in Blender's convention into a
+    world-to-camera matrix, whose rotation is the nearest exact rotation."""
     matrix = vector(transform_matrix, "transform_matrix", (4, 4))
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
     _check_rotation(axes, "transform_matrix")

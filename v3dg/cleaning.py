@@ -1,5 +1,5 @@
-"""Faults of an asset: gaussians that cannot be drawn, and gaussians far away from all
-others."""
+"""Finds faulty gaussians in an asset: those that cannot be drawn, and those far away
+from all others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,16 +11,17 @@ from v3dg import _core
 from v3dg.gaussians import Gaussians
 
 LARGEST = _core.most_length
-"""Largest coordinate or scale, in world units: squares of larger ones overflow float32.
-"""
+"""Largest valid coordinate or scale, in world units: the square of a larger one could
+overflow float32."""
 SMALLEST_OPACITY = float(np.float32(_core.min_alpha))
-"""Pixels skip contributions with a smaller alpha, so a gaussian with a smaller opacity
-is never drawn."""
+"""Smallest opacity that can be visible: pixels skip contributions with a smaller
+alpha."""
 OUTLIER_DISTANCE = 20.0
-"""Distance from the median position, in median distances, beyond which gaussians are
-sky, floaters or mistakes."""
+"""Distance from the median position, as a multiple of the median distance, beyond which
+a gaussian counts as an outlier: sky, a floater or a mistake."""
 
-# Kinds of gaussians that cannot be drawn, in the order of the core's bits.
+# Kinds of gaussians that cannot be drawn, in the order of the core's bits, with their
+# descriptions.
 _TEXT = {
     "means_not_finite": "with a position that is not finite",
     "quats_not_finite": "with a rotation that is not finite",
@@ -30,15 +31,16 @@ _TEXT = {
     "too_large": f"with a position or a scale beyond {LARGEST:g}",
     "negative_scale": "with a negative scale",
     "opacity_out_of_range": "with an opacity outside 0 to 1",
-    "transparent": "with an opacity below 1/255, which no pixel shows",
+    "transparent": "with an opacity below 1/255, which is invisible",
 }
 KINDS = tuple(_TEXT)
-_WRONG = (1 << KINDS.index("transparent")) - 1  # the bits of all kinds before it
+# The bits of all kinds before "transparent".
+_WRONG = (1 << KINDS.index("transparent")) - 1
 
 
 class AssetWarning(UserWarning):
-    """Gaussians of an asset have wrong values and were left out; or something in its
-    file was not understood, or read otherwise than it is written."""
+    """Emitted when gaussians of an asset have invalid values and are left out, or when
+    content of its file is ignored or converted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +50,10 @@ class Findings:
 
     Attributes:
         drawable: (N,) bool, on the host.
-        counts: Number of gaussians of each kind that cannot be drawn; kinds without any
-            are left out, and a gaussian can be of several kinds.
-        wrong: (N,) bool, those with wrong values; the others that cannot be drawn are
-            valid, but transparent.
+        counts: For each kind of fault, the number of gaussians that have it; kinds
+            without gaussians are missing. A gaussian can have several faults.
+        wrong: (N,) bool, whether a gaussian has invalid values. Gaussians that are
+            neither drawable nor wrong are valid but transparent.
     """
 
     drawable: npt.NDArray[np.bool_]
@@ -60,28 +62,28 @@ class Findings:
 
     @property
     def num_wrong(self) -> int:
-        """Gaussians with wrong values."""
+        """Number of gaussians with invalid values."""
         return int(self.wrong.sum())
 
     @property
     def num_dropped(self) -> int:
-        """Gaussians that cannot be drawn."""
+        """Number of gaussians that cannot be drawn."""
         return len(self.drawable) - int(self.drawable.sum())
 
     @property
     def text(self) -> str:
-        """One line that says how many cannot be drawn and why."""
+        """A one-line description of how many gaussians cannot be drawn, and why."""
         return summary(self.num_dropped, len(self.drawable), self.counts)
 
 
 def summary(num_dropped: int, num_gaussians: int, counts: Mapping[str, int]) -> str:
-    """Return one line that says how many gaussians of an asset cannot be drawn, and
-    why."""
+    """Return a one-line description of how many gaussians of an asset cannot be drawn,
+    and why."""
     return f"{num_dropped:,} of {num_gaussians:,} gaussians cannot be drawn: {describe(counts)}"
 
 
 def describe(counts: Mapping[str, int]) -> str:
-    """Counts of kinds in words."""
+    """Return the counts of faults as text."""
     return ", ".join(f"{count:,} {_TEXT[kind]}" for kind, count in counts.items())
 
 
@@ -98,8 +100,8 @@ def examine(asset: Gaussians) -> Findings:
 
 
 def has_no_rotation(asset: Gaussians) -> npt.NDArray[np.bool_]:
-    """(N,) whether each quaternion is zero. Such a gaussian is drawn as if it were not
-    rotated, and a quantised format cannot hold it."""
+    """Return (N,) whether each quaternion is zero. A gaussian with a zero quaternion is
+    drawn without rotation, and quantised formats cannot store it."""
     return np.asarray(~asset.numpy().quats.any(axis=1))
 
 
@@ -121,11 +123,11 @@ def outliers(
 
 
 def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.floating], float]:
-    """Return the centre (3,) and the radius, above 0, of a ball around nearly all of N
-    > 0 points (N, 3).
+    """Return the centre (3,) and the radius, which is positive, of a ball that contains
+    nearly all points (N, 3); N > 0.
 
-    It is the part to look at: trained assets have a few gaussians far away from all
-    others.
+    A few gaussians of a trained asset are far away from all others and would make a
+    ball around all of them too large for a view.
     """
     low, high = np.percentile(points, (1, 99), axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)

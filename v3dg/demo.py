@@ -1,9 +1,9 @@
-"""A demonstration without a download: it builds a bundle, places it 2,000 times, and
-draws it from near to far.
+"""A demonstration that needs no data: it builds a bundle, places 2,000 instances, and
+draws them at several distances.
 
-The result is one picture with a column per distance: the full asset above, the selected
-cut below. Every panel states the number of gaussians, the time, and the error against
-the full asset at twice the resolution.
+The result is one picture with a column for each distance. The upper row shows the full
+asset, the lower row the selected cut. Every panel states the number of gaussians, the
+time, and the error against the full asset at twice the resolution.
 """
 
 import math
@@ -31,15 +31,15 @@ from v3dg.scene import Scene
 from v3dg.scene.file import write_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-# Distance from the eye to the central donut, in radii of a donut, and elevation in
-# radians.
+# For each column: the distance from the eye to the central donut, in radii of a donut,
+# and the elevation in radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
-_AZIMUTH = 0.80  # radians; the sun is then behind the camera
+_AZIMUTH = 0.80  # radians; the sun is behind the camera
 _SKY = (0.6, 0.73, 0.85)
 
 
 def _output(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a picture, whose folder is made."""
+    """Return the path of the picture, after creating its folder."""
     output = check_picture_path(path)
     _files.make_folder(output)
     return output
@@ -58,19 +58,20 @@ def run_demo(
     device: str = "auto",
     keep: str | os.PathLike[str] | None = None,
 ) -> JsonObject:
-    """Make an asset, build and place it, draw and measure it at every distance, and
-    write the picture.
+    """Make an asset, build its bundle, place instances, draw and measure them at every
+    distance, and write the picture.
 
     Args:
         num_gaussians: Number of gaussians in the asset.
         size: Width and height of one panel in px.
-        views: Distance and elevation of every column.
+        views: Distance and elevation for each column, as in `VIEWS`.
         device: The device that builds and draws: "auto", "cpu" or "cuda".
-        keep: Folder for the asset, its bundle and the scene with the cameras of the
-            columns, which is created if needed; None keeps nothing.
+        keep: Folder in which the asset, its bundle and the scene with the cameras of
+            the columns are stored. It is created if needed. With None, they are not
+            stored.
 
     Returns:
-        Sizes, times and errors, as JSON values.
+        Sizes, times and errors as a JSON object.
 
     Raises:
         ValueError: The picture cannot be written to ``output``, or an argument is out
@@ -117,7 +118,7 @@ def _columns(
 def _rows(
     views: Sequence[tuple[float, float]], panels: Sequence[tuple["_Panel", "_Panel"]]
 ) -> list[list[tuple[str, Picture]]]:
-    """Return the rows of the result: the full asset above, the selected cut below."""
+    """Return the rows of the picture: the full asset above, the selected cut below."""
     rows: list[list[tuple[str, Picture]]] = [[], []]
     for (distance, _), pair in zip(views, panels, strict=True):
         for row, kind, panel in zip(rows, ("full", "bundle"), pair, strict=True):
@@ -126,12 +127,12 @@ def _rows(
 
 
 def _cameras(views: Sequence[tuple[float, float]], size: tuple[int, int]) -> list[Camera]:
-    """The cameras of the columns."""
+    """Return the cameras of the columns."""
     return [_camera(distance, elevation, size) for distance, elevation in views]
 
 
 class _Files(NamedTuple):
-    """Files to go on with."""
+    """The files that are kept."""
 
     asset: Path
     bundle: Path
@@ -139,14 +140,18 @@ class _Files(NamedTuple):
 
     @classmethod
     def new(cls, keep: str | os.PathLike[str] | None) -> "_Files | None":
-        """Create a folder and return the paths of the files in it, none of which may
-        exist yet; None without a folder."""
+        """Create a folder and return the paths of its files, which must not exist yet;
+        return None if `keep` is None."""
         if keep is None:
             return None
         folder = Path(keep)
         files = cls(folder / "donut.ply", folder / "donut.v3dg", folder / "donuts.json")
         for file in files:
-            check(file, not os.path.lexists(file), "a new file, got one that exists; remove it")
+            check(
+                file,
+                not os.path.lexists(file),
+                "a new file, got an existing one; remove it or choose another folder",
+            )
         _files.make_folder(files.asset)
         return files
 
@@ -158,7 +163,7 @@ class _Files(NamedTuple):
         size: tuple[int, int],
     ) -> Scene:
         """Write the asset, its bundle, and the scene with the cameras of the columns;
-        returns the scene of the file."""
+        return the scene that the file describes."""
         write_asset(self.asset, asset)
         scene.bundles[0].write(self.bundle)
         placed = Scene()
@@ -185,8 +190,8 @@ def _field(bundle: Bundle, count: int, seed: int) -> Scene:
 
 
 def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
-    """Return a camera that looks at the middle of the field: at one donut from near, at
-    the whole hill from far."""
+    """Return a camera that looks at the middle of the field: at one donut from a small
+    distance, at the whole hill from a large one."""
     horizontal = distance * math.cos(elevation)
     target = 0.42 / (1 + (distance / 12) ** 2)
     x = math.sin(_AZIMUTH) * horizontal
@@ -196,7 +201,7 @@ def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
 
 
 class _Panel(NamedTuple):
-    """One panel of the result, with its measurements."""
+    """A panel of the picture, with its measurements."""
 
     numbers: JsonObject
     text: str

@@ -1,5 +1,5 @@
-"""An asset that needs no download: a glazed donut, made from a seed, and a field of
-many donuts."""
+"""A test asset that needs no data: a glazed donut generated from a seed, and positions
+for a field of donuts."""
 
 import math
 from dataclasses import dataclass
@@ -20,33 +20,34 @@ _SPRINKLE_COLORS = np.array(
     [[0.95, 0.95, 0.9], [0.9, 0.6, 0.03], [0.05, 0.3, 0.8], [0.02, 0.5, 0.3], [0.8, 0.05, 0.04]]
 )
 _TO_SUN = np.array([0.42, -0.50, 0.76])
-_SH_C0 = _core.sh_base0  # factor of the constant basis function
+_SH_C0 = _core.sh_base0  # value of the constant basis function
 _SH_C1 = 0.4886025119029199  # factor of the linear basis functions
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
-    """Make a donut of dough, icing that drips over its rim, and sprinkles.
+    """Make a donut with icing and sprinkles.
 
     Args:
         num_gaussians: Exact number of gaussians.
         seed: The same seed gives the same gaussians.
 
     Returns:
-        NumPy gaussians of SH degree 1; z is up, the origin is in the middle of the
-        hole, the radius is 1.
+        NumPy gaussians of SH degree 1. z is up, the origin is the middle of the hole,
+        and the radius is 1.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
     """
     check("num_gaussians", num_gaussians >= 1000, f"at least 1000, got {num_gaussians}")
     rng = np.random.default_rng(seed)
-    count = num_gaussians // 5 // _SPRINKLES  # in each sprinkle
+    count = num_gaussians // 5 // _SPRINKLES  # number of gaussians in each sprinkle
     on_tube = num_gaussians - count * _SPRINKLES
     surface = _tube(on_tube, rng)
     if count:
         surface = surface.followed_by(_sprinkles(count, rng))
-    order = rng.permutation(num_gaussians)  # files of trained assets have no order either
+    # In files of trained assets, the order is random, too.
+    order = rng.permutation(num_gaussians)
     longest = 1.2 * surface.spacing * np.exp(rng.normal(scale=0.4, size=num_gaussians))
     middle = longest * np.exp(-rng.gamma(2, 0.25, num_gaussians))
     thinnest = middle * np.exp(-rng.gamma(3, 0.7, num_gaussians))
@@ -81,17 +82,18 @@ class _Surface:
     gloss: Floats
 
     def followed_by(self, surface: "_Surface") -> "_Surface":
-        """Return the points of this surface, then those of another."""
+        """Return a surface with the points of this one, followed by those of
+        another."""
         pairs = zip(vars(self).values(), vars(surface).values(), strict=True)
         return _Surface(*(np.concatenate(arrays) for arrays in pairs))
 
 
 def _tube(count: int, rng: np.random.Generator) -> _Surface:
-    """Return the dough with its icing, with this number of points."""
+    """Return the dough and its icing, with this number of points."""
     azimuth = rng.uniform(0, 2 * np.pi, count)
     angles = np.linspace(-np.pi, np.pi, 1000)
     # The angle in the cross-section of the tube is 0 at the outside and pi/2 at the
-    # top; points are spread evenly over the surface.
+    # top. Angles are chosen so that points are evenly distributed over the surface.
     share = (_RING * (angles + np.pi) + _TUBE * np.sin(angles)) / (2 * np.pi * _RING)
     section_angle = np.interp(rng.random(count), share, angles)
     phase = rng.uniform(0, 2 * np.pi, (2, 4, 1))
@@ -102,7 +104,7 @@ def _tube(count: int, rng: np.random.Generator) -> _Surface:
     points, normals = _on_tube(azimuth, section_angle, _DOUGH + (_TUBE - _DOUGH) * np.sqrt(icing))
     waves = np.sin(points @ rng.normal(scale=9, size=(3, 6)) + rng.uniform(0, 6.28, 6))
     blotch = waves.mean(1, keepdims=True)
-    # The pale stripe, which stays above the oil during frying.
+    # The stripe of a donut that stays above the oil during frying is pale.
     pale = np.exp(-((section_angle / 0.3) ** 2))[:, None]
     dough = np.array([0.42, 0.17, 0.035]) * (1 + 0.5 * blotch)
     dough += (np.array([0.7, 0.46, 0.19]) - dough) * pale
@@ -120,7 +122,7 @@ def _on_tube(azimuth: Floats, section_angle: Floats, radius: Floats) -> tuple[Fl
 
 
 def _sprinkles(count: int, rng: np.random.Generator) -> _Surface:
-    """Return sugar rods of ``count`` points each, which lie on the icing in all
+    """Return sprinkles: rods of ``count`` points each, which lie on the icing in random
     directions."""
     azimuth = rng.uniform(0, 2 * np.pi, _SPRINKLES)
     section_angle = rng.uniform(0.2 * np.pi, 0.8 * np.pi, _SPRINKLES)
@@ -146,7 +148,7 @@ def _sprinkles(count: int, rng: np.random.Generator) -> _Surface:
 
 
 def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
-    """Return quaternions (n, 4) of rotations from z to the normals, after a random
+    """Return quaternions (n, 4) of rotations that turn z to the normals, after a random
     rotation about z."""
     half = normals + np.array([0.0, 0.0, 1.0 + 1e-9])
     x, y, z = half.T / np.linalg.norm(half, axis=1)
@@ -157,8 +159,8 @@ def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _lit(normals: Floats, albedo: Floats, gloss: Floats) -> Floats:
-    """Return colours under a sun and a sky, with highlights towards the mirror image of
-    the sun, (n, 4, 3)."""
+    """Return SH coefficients (n, 4, 3) of colours lit by a sun and a sky. The linear
+    coefficients add highlights towards the reflection of the sun."""
     facing = np.maximum(normals @ _TO_SUN, 0)[:, None]
     light = facing * np.array([1.5, 1.4, 1.2]) + (0.45 + 0.3 * normals[:, 2:]) * np.array(
         [0.5, 0.55, 0.62]

@@ -1,7 +1,7 @@
-"""Edits of assets: crop, delete, drop, cut the degree, join.
+"""Edits assets: crops, drops gaussians, changes the SH degree, joins.
 
-Each function returns new gaussians and leaves its argument alone. Positions and lengths
-are in the frame of the asset, as `read_asset` returns it.
+Each function returns new gaussians and does not change its arguments. Positions and
+lengths are in the frame of the asset, as returned by `read_asset`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,22 +27,28 @@ def crop_box(
     *,
     keep: Part = "inside",
 ) -> Gaussians:
-    """Keep the gaussians whose centres lie in a box, or all others.
+    """Return the gaussians whose centres are in a box, or all others.
 
-    A centre on the surface is inside, one that is not finite outside.
+    A centre on the surface counts as inside; a centre that is not finite counts as
+    outside.
 
     Args:
-        low: (3,) the corner with the smallest coordinates; -inf leaves a side open.
-        high: (3,) the opposite corner; inf leaves a side open.
-        keep: The part that is kept; "outside" deletes what is in the box.
+        low: (3,) the corner with the smallest coordinates; -inf means no limit.
+        high: (3,) the opposite corner; inf means no limit.
+        keep: The part that is kept; "outside" removes the gaussians in the box.
 
     Raises:
-        ValueError: A corner is not three numbers, or ``high`` is below ``low``.
+        ValueError: A corner is not three numbers, or a coordinate of ``high`` is less
+            than that of ``low``.
     """
     lowest = _corner(low, "low")
     highest = _corner(high, "high")
     is_box = (lowest <= highest).all()
-    check("low, high", is_box, f"no coordinate of high below low, got {lowest} and {highest}")
+    check(
+        "low, high",
+        is_box,
+        f"high to be at least low in each coordinate, got {lowest} and {highest}",
+    )
     means = _check_gaussians(gaussians).numpy().means
     with np.errstate(invalid="ignore"):
         is_inside = ((means >= lowest) & (means <= highest)).all(axis=1)
@@ -56,17 +62,18 @@ def crop_sphere(
     *,
     keep: Part = "inside",
 ) -> Gaussians:
-    """Keep the gaussians whose centres lie in a sphere, or all others.
+    """Return the gaussians whose centres are in a sphere, or all others.
 
-    A centre on the surface is inside, one that is not finite outside.
+    A centre on the surface counts as inside; a centre that is not finite counts as
+    outside.
 
     Args:
-        center: (3,).
-        radius: > 0.
-        keep: The part that is kept; "outside" deletes what is in the sphere.
+        center: (3,) centre of the sphere.
+        radius: Radius of the sphere, > 0.
+        keep: The part that is kept; "outside" removes the gaussians in the sphere.
 
     Raises:
-        ValueError: An argument is not as above.
+        ValueError: An argument is invalid.
     """
     middle = _corner(center, "center")
     check("center", np.isfinite(middle).all(), f"finite numbers, got {middle}")
@@ -78,10 +85,11 @@ def crop_sphere(
 
 
 def drop_outliers(gaussians: Gaussians) -> Gaussians:
-    """Drop gaussians that lie far away from all others: sky, floaters, mistakes.
+    """Return the gaussians without outliers: sky, floaters and mistakes.
 
-    They are further than 20 median distances from the median position of the gaussians
-    that can be drawn, as `v3dg info` counts them. Positions that are not finite stay.
+    An outlier is more than 20 times the median distance away from the median position
+    of the drawable gaussians. `v3dg info` prints the number of outliers. Gaussians
+    whose positions are not finite are kept.
     """
     host = _check_gaussians(gaussians).numpy()
     is_finite = np.isfinite(host.means).all(axis=1)
@@ -93,25 +101,27 @@ def drop_outliers(gaussians: Gaussians) -> Gaussians:
 
 
 def drop_transparent(gaussians: Gaussians, min_opacity: float) -> Gaussians:
-    """Drop gaussians whose opacity is below a limit of 0 to 1, or not a number.
+    """Return the gaussians whose opacity is at least a limit; NaN counts as less.
 
     Raises:
-        ValueError: The limit is not a number of 0 to 1.
+        ValueError: The limit is not a number from 0 to 1.
     """
-    limit = real(min_opacity, "min_opacity", "a number of 0 to 1", 0.0, 1.0)
+    limit = real(min_opacity, "min_opacity", "a number from 0 to 1", 0.0, 1.0)
     opacities = _check_gaussians(gaussians).numpy().opacities
-    # Rounded as opacities are, so that an opacity of 0.1 is not below 0.1.
+    # The limit is rounded to float32 like the opacities, so that an opacity of 0.1 is
+    # not below 0.1.
     with np.errstate(invalid="ignore"):
         return gaussians.subset(opacities >= np.float32(limit))
 
 
 def to_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Cut the spherical harmonics down to a degree of 0 to 3, or extend them by zeros.
+    """Return the gaussians with another SH degree, 0 to 3: coefficients of higher
+    degrees are removed, and missing ones are zero.
 
     Raises:
-        ValueError: There is no such degree.
+        ValueError: The degree is not 0, 1, 2 or 3.
     """
-    count = (whole(degree, "degree", "0 to 3", 0, 3) + 1) ** 2
+    count = (whole(degree, "degree", "an SH degree from 0 to 3", 0, 3) + 1) ** 2
     sh = _check_gaussians(gaussians).sh
     has_count = int(sh.shape[1])
     if count == has_count:
@@ -131,10 +141,10 @@ def to_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 
 
 def join(parts: Sequence[Gaussians]) -> Gaussians:
-    """Join assets into one, in order; those of lower SH degree get coefficients of
-    zero.
+    """Join assets into one, in order. The SH degree is the highest of all parts;
+    missing coefficients are zero.
 
-    `Gaussians.transform` places a part before.
+    Use `Gaussians.transform` to place a part first.
 
     Raises:
         ValueError: There are no parts.
@@ -155,7 +165,7 @@ def _check_gaussians(gaussians: Gaussians) -> Gaussians:
 
 
 def _corner(values: Array | npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
-    """Three numbers, which may be infinite."""
+    """Return three numbers, which may be infinite."""
     host: Array = values
     if hasattr(host, "detach"):
         host = host.numpy(force=True)

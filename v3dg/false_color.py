@@ -1,5 +1,5 @@
-"""False colours: palettes that show the level or the cluster of gaussians, or what is
-missing."""
+"""False colours: palettes that show the levels, the clusters or the missing pages of a
+bundle."""
 
 from typing import Literal, TypeAlias
 
@@ -13,8 +13,8 @@ ColorBy: TypeAlias = Literal["appearance", "level", "cluster", "residency"]
 
 
 def palette_of(bundle: Bundle, color_by: ColorBy) -> npt.NDArray[np.float32] | None:
-    """Return SH coefficients of degree 0 (C, 3) that clusters are drawn with; None for
-    their own colours."""
+    """Return SH coefficients of degree 0 (C, 3), one colour for each cluster; None for
+    the gaussians' own colours."""
     if color_by == "appearance":
         return None
     level = bundle.clusters.level
@@ -22,6 +22,6 @@ def palette_of(bundle: Bundle, color_by: ColorBy) -> npt.NDArray[np.float32] | N
         colors = _core.level_colors(bundle.num_levels)[level]
     elif color_by == "cluster":
         colors = _core.cluster_colors(len(level))
-    else:  # a bundle whose pages are all resident misses nothing
+    else:  # no pages are missing, as all are resident
         colors = _core.missing_colors(np.zeros_like(level))
     return np.ascontiguousarray((colors - 0.5) / _core.sh_base0, np.float32)

@@ -1,10 +1,11 @@
-"""The first view of a subject: all of an object from outside, a room from inside.
+"""Chooses the first view of a subject: an object is seen from outside, a room from
+inside.
 
-A grid of voxels around most of the gaussians says how much of every direction is
-blocked from each place (ambient occlusion). A subject surrounds its viewer if much of
-its middle is free, closed on nearly all sides, and holds something beside its outer
-walls: a room does, while a solid object has no such place, and a hollow one has nothing
-in it.
+A grid of voxels around most of the gaussians tells how many directions are blocked from
+each place (ambient occlusion). A subject counts as a room if much of its middle is
+empty, these empty places are blocked in nearly all directions, and there is content
+away from the outer walls. A solid object has no such empty places, and a hollow object
+has no content inside.
 """
 
 import itertools
@@ -24,50 +25,54 @@ from v3dg.rotations import rotation_from_quaternion
 from v3dg.scene import Scene, Subject
 
 DEFAULT_ELEVATION = math.radians(20)
-"""Height of the first camera above the horizon, in radians, for a subject that is seen
-from outside."""
+"""Elevation of the first camera above the horizon, in radians, for an object."""
 
-# Enough gaussians to find where a subject is and what surrounds it, and quick to read.
+# Limits of the number of gaussians that are examined: enough for a good view, and quick
+# to read.
 _MOST_GAUSSIANS = 60_000
 _MOST_INSTANCES = 15_000
-# Views around an object; a turntable is so far away that each of them shows it all.
+# Number of views that determine the distance of a turntable, from which each view shows
+# all of an object.
 _DISTANCE_VIEWS = 36
-# Share of the picture that stays free at each of its sides.
+# Margin on each side of the picture, as a share of its size.
 _MARGIN = 0.04
-# Tangents of half the field of view across the shorter side, and at most across the
-# longer one, which would be distorted beyond that.
+# Tangents of half the field of view, across the shorter side of the picture, and the
+# maximum across the longer side. Wider pictures would be distorted.
 _OUTSIDE_TANGENT = math.tan(math.radians(22.5))
 _OUTSIDE_MOST = 1.0
 _INSIDE_TANGENT = math.tan(math.radians(32.5))
 _INSIDE_MOST = 1.2
 _INSIDE_PITCH = math.radians(-8)
 
-# Length of a step by which a box grows, as a share of its side; the most steps; and the
-# least share of the weight of all gaussians in one.
+# Length of a step by which a box grows, as a share of its side; the maximum number of
+# steps; and the minimum weight of the gaussians in a step, as a share of the total
+# weight.
 _STEP = 0.06
 _MOST_STEPS = 100
 _LEAST_WEIGHT = 2e-4
 
-_VOXELS = 40  # along each side of the grid
+_VOXELS = 40  # number of voxels along each side of the grid
 _DIRECTIONS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
-# Share of directions that are blocked from a place inside a room, and the clearance and
-# the share of the middle that such places have, by which rooms differ from objects:
-# measured on captured and made rooms, towns, figures and rings.
+# Limits that distinguish rooms from objects: the share of directions that must be
+# blocked from a place in a room, the clearance of such a place, and the share of the
+# middle that such places fill. They were measured on captured and made rooms, towns,
+# figures and rings.
 _CLOSED = 0.75
 _CLEARANCE = 0.1 * _VOXELS
 _LEAST_FREE = 0.1
-# Share of what blocks that stands free of the outer walls.
+# Minimum share of the content that is away from the outer walls.
 _LEAST_CONTENT = 0.02
 _WALL_VOXELS = 3
 
 
 class _Sample(NamedTuple):
-    """Gaussians that stand for a subject.
+    """A sample of the gaussians of a subject.
 
     Attributes:
         means: (N, 3) centres.
-        first_axes, second_axes: (N, 3) the two longer half axes.
-        weights: (N,) opacities, times the number of gaussians that each stands for.
+        first_axes, second_axes: (N, 3) the two longest semi-axes of each gaussian.
+        weights: (N,) opacities, multiplied by the number of gaussians that each one
+            represents.
     """
 
     means: Floats
@@ -78,12 +83,12 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Framing:
-    """The place and extent of a subject, which determine its first views.
+    """The position and extent of a subject, which determine its first views.
 
     Attributes:
         center: (3,) centre of the box around nearly all gaussians, world units.
         radius: Half of the diagonal of that box, above 0.
-        points: (P, 3) points that the first picture of an object shows.
+        points: (P, 3) points that the first picture of an object must contain.
     """
 
     center: Floats
@@ -93,7 +98,7 @@ class Framing:
 
     @property
     def is_inside(self) -> bool:
-        """Whether the subject surrounds its first camera."""
+        """Whether the subject is a room, which is seen from inside."""
         return self._places is not None
 
     def camera(
@@ -105,14 +110,15 @@ class Framing:
         elevation: float = DEFAULT_ELEVATION,
         azimuth: float = 0.0,
     ) -> Camera:
-        """Return the first camera for pictures of this size: all of an object is in
-        them, whatever their aspect.
+        """Return the first camera for a picture of this size, which contains all of an
+        object for any aspect ratio.
 
         Args:
             up: (3,) direction in the world.
-            elevation: Angle above the horizon, radians, for an object.
-            azimuth: Angle by which it goes around an object, or turns inside a room,
-                radians.
+            elevation: Angle of the camera above the horizon in radians; used only for
+                an object.
+            azimuth: Angle in radians by which the camera is moved around an object, or
+                turned inside a room.
         """
         axis = _unit(up)
         if self._places is not None:
@@ -147,9 +153,9 @@ class Framing:
         *,
         elevation: float = DEFAULT_ELEVATION,
     ) -> list[Camera]:
-        """Return cameras that go once around an object at one distance, from which each
-        sees all of it, or turn once inside a room. The distance does not depend on
-        their number, so view 0 is the same for all numbers."""
+        """Return cameras that go around an object in a circle, each of which shows all
+        of it, or that turn around inside a room. The distance does not depend on
+        ``count``, so the first view is the same for any number of views."""
         axis = _unit(up)
         if self._places is not None:
             size = (width, height)
@@ -179,7 +185,7 @@ class Framing:
         ]
 
     def focus(self, camera: Camera) -> Floats:
-        """Return the (3,) point ahead of a first camera that it turns about."""
+        """Return the (3,) point in front of a camera around which a viewer orbits."""
         forward = camera.viewmat[2, :3]
         if self._places is not None:
             return np.asarray(camera.position + 0.5 * self.radius * forward)
@@ -189,7 +195,7 @@ class Framing:
     def _inside(
         self, places: "_Places", axis: Floats, size: tuple[int, int], azimuth: float
     ) -> Camera:
-        """Return the camera at the place in a room from which most is visible."""
+        """Return a camera in a room, at the place from which most is visible."""
         eye, best_azimuth = places.best(axis)
         forward = -_outwards(axis, -_INSIDE_PITCH, best_azimuth + azimuth)
         right_tangent, _ = _tangents(*size, _INSIDE_TANGENT, widest=_INSIDE_MOST)
@@ -204,15 +210,16 @@ class Framing:
 
 
 def _azimuths(count: int) -> list[float]:
-    """Return angles all around, in radians, from 0 on."""
+    """Return evenly spaced angles in radians from 0 up to a full circle."""
     return [2 * math.pi * number / count for number in range(count)]
 
 
 def frame_subject(subject: Subject) -> Framing:
-    """Find where a scene, a bundle or an asset is, and from where it is seen best.
+    """Find the position and extent of a scene, a bundle or an asset, and whether it is
+    a room.
 
-    Of a bundle, a coarse level is read. A subject without gaussians has a ball of
-    radius 1 at the origin.
+    Only a coarse level of a bundle is read. A subject without gaussians is treated as a
+    ball of radius 1 at the origin.
     """
     sample = _sample(subject)
     if not len(sample.means):
@@ -249,7 +256,7 @@ def _empty_sample() -> _Sample:
 def _coarse_level(bundle: Bundle) -> Gaussians:
     """Return the finest undamaged level that is quick to read, else the coarsest level.
 
-    Drawing reports damaged pages; a first view can do without them.
+    Damaged pages are not reported here, because drawing reports them.
     """
     levels = range(bundle.num_levels)
     for level in levels:
@@ -264,7 +271,8 @@ def _coarse_level(bundle: Bundle) -> Gaussians:
 
 
 def _sample_of(asset: Gaussians, most_rows: int) -> _Sample:
-    """Return at most `most_rows` gaussians of an asset, evenly spaced in its order."""
+    """Return at most `most_rows` gaussians of an asset, evenly distributed over its
+    rows."""
     count = min(most_rows, len(asset))
     rows = asset.numpy().subset(np.linspace(0, len(asset) - 1, count).astype(np.int64))
     scales = np.asarray(rows.scales, np.float64)
@@ -298,12 +306,11 @@ def _placed(local: _Sample, scene: Scene, instances: npt.NDArray[np.int64]) -> _
 
 
 def _box(means: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the lowest and the highest corner of a box around all gaussians that are
-    not far from the others.
+    """Return the minimum and the maximum corner of a box around the gaussians, without
+    those far away from the others.
 
-    From the middle 96 % along each axis the box grows in steps while there are
-    gaussians in the next step, so that a thin tip belongs to it and a distant sky does
-    not.
+    The box begins as the middle 96 % along each axis. It grows in steps as long as the
+    next step contains gaussians, so that it includes thin tips but not a distant sky.
     """
     low, high = np.percentile(means, (2, 98), axis=0)
     longest = float((high - low).max())
@@ -317,7 +324,7 @@ def _box(means: Floats, weights: Floats) -> tuple[Floats, Floats]:
 
 
 def _steps_with_gaussians(distances: Floats, weights: Floats) -> int:
-    """Return the number of consecutive steps beyond a border that have gaussians."""
+    """Return the number of consecutive steps beyond a border that contain gaussians."""
     is_beyond = (distances > 0) & (distances <= _MOST_STEPS)
     numbers = np.ceil(distances[is_beyond]).astype(np.int64) - 1
     amounts = np.bincount(numbers, weights[is_beyond], _MOST_STEPS)
@@ -328,7 +335,8 @@ def _steps_with_gaussians(distances: Floats, weights: Floats) -> int:
 
 
 def _outline(sample: _Sample, low: Floats, high: Floats) -> Floats:
-    """Return (P, 3) points of the gaussians in a box, at two standard deviations."""
+    """Return (P, 3) points that outline the gaussians in a box: centres, and ends of
+    axes at two standard deviations."""
     is_inside = ((sample.means >= low) & (sample.means <= high)).all(axis=1)
     means = sample.means[is_inside]
     first = sample.first_axes[is_inside]
@@ -344,15 +352,15 @@ def _outline(sample: _Sample, low: Floats, high: Floats) -> Floats:
 
 def _unit(vector: VectorLike) -> Floats:
     values = np.asarray(vector, np.float64)
-    scaled = values / np.abs(values).max()  # squares neither overflow nor underflow
+    scaled = values / np.abs(values).max()  # prevents overflow and underflow of squares
     return np.asarray(scaled / np.linalg.norm(scaled))
 
 
 def _outwards(up: Floats, elevation: float, azimuth: float) -> Floats:
     """Return the (3,) unit vector from a subject to its camera.
 
-    At azimuth 0 the camera is where viewers take the front of an asset to be: at +z
-    where y or x is up or down, at -y where z is.
+    At azimuth 0, the camera is in front of the asset by the convention of viewers: on
+    the side of -y if z is the vertical axis, else on the side of +z.
     """
     front = np.array([0.0, 0.0, 1.0])
     if int(np.abs(up).argmax()) == 2:
@@ -365,7 +373,8 @@ def _outwards(up: Floats, elevation: float, azimuth: float) -> Floats:
 
 
 def _tangents(width: int, height: int, shorter: float, *, widest: float) -> tuple[float, float]:
-    """Return the tangents of half the fields of view across width and height."""
+    """Return the tangents of half the horizontal and half the vertical field of
+    view."""
     ratio = max(width, height) / min(width, height)
     longer = min(shorter * ratio, widest)
     if width >= height:
@@ -374,7 +383,7 @@ def _tangents(width: int, height: int, shorter: float, *, widest: float) -> tupl
 
 
 def _across(forward: Floats, up: Floats) -> tuple[Floats, Floats]:
-    """Return the (3,) unit vectors to the right and down in a picture."""
+    """Return the (3,) unit vectors that point right and down in a picture."""
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     return right, np.cross(forward, right)
@@ -383,8 +392,8 @@ def _across(forward: Floats, up: Floats) -> tuple[Floats, Floats]:
 def _eye_that_sees(
     points: Floats, forward: Floats, up: Floats, right_tangent: float, down_tangent: float
 ) -> Floats:
-    """Return (3,) the nearest eye whose frustum contains all points, with equal free
-    space to the left and the right, or above and below."""
+    """Return the nearest eye (3,) whose frustum contains all points, with equal margins
+    on the left and the right, or above and below."""
     right, down = _across(forward, up)
     depths = points @ forward
     place = np.zeros(3)
@@ -402,10 +411,10 @@ class _Grid(NamedTuple):
     """Voxels around most of the gaussians.
 
     Attributes:
-        origin, side: Lowest corner, and length of a voxel, world units.
+        origin, side: Minimum corner of the grid, and side of a voxel, in world units.
         density: (V, V, V) optical density across a voxel.
-        distances: (26, V, V, V) from each voxel to what blocks each direction, in
-            voxels; infinite where nothing does.
+        distances: (26, V, V, V) distance in voxels from each voxel to the next solid
+            voxel in each direction; infinite without one.
     """
 
     origin: Floats
@@ -424,8 +433,8 @@ class _Grid(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Places inside a room: (N, 3), with gaussians (M, 3) that are to be seen from
-    them, and the size of the room."""
+    """Places inside a room (N, 3), the gaussians (M, 3) that a view should show, and
+    the size of the room."""
 
     places: Floats
     means: Floats
@@ -434,8 +443,8 @@ class _Places:
     _best: dict[tuple[float, ...], tuple[Floats, float]] = field(default_factory=dict)
 
     def best(self, up: Floats) -> tuple[Floats, float]:
-        """Return the place, and the azimuth, from which most is visible and nothing is
-        close; views of all sizes and azimuths share the search."""
+        """Return the place and the azimuth from which most is visible and nothing is
+        close. The result of the search is cached for each up vector."""
         key = tuple(up.tolist())
         if key not in self._best:
             self._best[key] = self._search(up)
@@ -457,7 +466,7 @@ class _Places:
         return best[1], best[2]
 
     def _scores(self, place: Floats, up: Floats) -> Floats:
-        """Return how much is visible from a place at each of its azimuths."""
+        """Return, for each azimuth, how much is visible from a place."""
         front = -_outwards(up, 0.0, 0.0)
         aside = np.cross(up, front)
         offsets = self.means - place
@@ -466,7 +475,7 @@ class _Places:
         in_height = np.abs(np.arcsin(np.clip(sines, -1, 1)) - _INSIDE_PITCH) < 0.6
         azimuths = np.arctan2(offsets @ aside, offsets @ front)
         numbers = np.round(azimuths / (2 * math.pi) * _AZIMUTHS).astype(np.int64) % _AZIMUTHS
-        # What is close by covers the rest.
+        # Near objects count negatively, because they hide the others.
         weights = np.where(distances > 0.2 * self.size, 1.0, -4.0) * self.weights
         histogram = np.bincount(numbers[in_height], weights[in_height], _AZIMUTHS)
         reach = range(-_AZIMUTHS // 10, _AZIMUTHS // 10 + 1)
@@ -477,8 +486,7 @@ _AZIMUTHS = 36
 
 
 def _places(sample: _Sample) -> _Places | None:
-    """Return the places inside a subject that surrounds its viewer; None for any other
-    subject."""
+    """Return the places inside a subject if it is a room, otherwise None."""
     grid = _grid(sample)
     if grid is None:
         return None
@@ -505,8 +513,8 @@ def _places(sample: _Sample) -> _Places | None:
 
 
 def _grid(sample: _Sample) -> _Grid | None:
-    """Return the voxels around most of a sample; None if there are too few gaussians to
-    enclose a place."""
+    """Return a grid of voxels around most of a sample; None if there are too few
+    gaussians to enclose a place."""
     means = sample.means
     if len(means) < 200:
         return None
@@ -533,7 +541,8 @@ def _grid(sample: _Sample) -> _Grid | None:
 
 
 def _distances(is_solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-    """Return the distances (26, V, V, V) to the next solid voxel in each direction."""
+    """Return the distances (26, V, V, V), in voxels, to the next solid voxel in each
+    direction."""
     distances = np.full((len(_DIRECTIONS), *is_solid.shape), np.inf, np.float32)
     for number, direction in enumerate(_DIRECTIONS):
         source = tuple(_shifted(step) for step in direction)
@@ -554,8 +563,8 @@ def _shifted(step: int) -> slice:
 
 
 def _grown(mask: npt.NDArray[np.bool_], count: int) -> npt.NDArray[np.bool_]:
-    """Return a mask that is grown by `count` voxels; all voxels outside of the grid
-    belong to it."""
+    """Return a mask that is dilated by `count` voxels. Voxels outside the grid count as
+    part of the mask."""
     grown = np.pad(mask, count, constant_values=True)
     for _ in range(count):
         wider = grown.copy()

@@ -22,10 +22,10 @@ Array: TypeAlias = (
 )
 
 TRAINED_FILTER_PX2 = 0.3
-"""Variance of the filter that trainers draw with, px²: the value of the code of 3DGS
-and of gsplat, with antialiasing and without."""
+"""Variance of the screen-space filter that trainers draw with, px². It is the same in
+the code of 3DGS and in gsplat, with and without antialiasing."""
 
-_NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients per channel -> degree
+_NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients per channel -> SH degree
 
 
 def _is_tensor(value: object) -> bool:
@@ -43,16 +43,16 @@ def _kind(value: object) -> str:
 
 
 class _Trained:
-    """How gaussians were trained: in a slot, so that `vars` of gaussians has their
-    arrays and nothing else."""
+    """Whether gaussians were trained with antialiasing. The value is in a slot, so that
+    `vars` of gaussians contains only their arrays."""
 
     __slots__ = ("_antialiased",)
     _antialiased: bool | None
 
     @property
     def antialiased(self) -> bool | None:
-        """Whether opacities were trained to be compensated for the filter of the
-        rasterizer; None if that is not known. See `trained`."""
+        """Whether opacities were trained to compensate for the filter of the
+        rasterizer; None if unknown. See `trained`."""
         return self._antialiased
 
 
@@ -70,16 +70,16 @@ class Gaussians(_Trained):
         scales: (N, 3) standard deviations along the rotated axes, in world units; not
             logarithms.
         opacities: (N,) in [0, 1]; not logits.
-        sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3;
-            colour is their value in the view direction plus ½.
+        sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3; a
+            colour is ½ plus the value of the harmonics in the view direction.
 
-    Kinds, shapes, dtypes and layout are checked here, values are not. Nothing is
-    copied. `antialiased` is None until `trained` sets it, as readers of files do; what
-    is made of gaussians by the methods below keeps it.
+    Types, shapes, dtypes and memory layout are checked here, but not values. Nothing is
+    copied. `antialiased` is None at first; `trained` returns gaussians with another
+    value, which the results of all methods keep.
 
     Raises:
-        TypeError: an argument is not an array, or NumPy and torch are mixed.
-        ValueError: wrong shape, dtype, device or memory layout.
+        TypeError: An argument is not an array, or NumPy and torch are mixed.
+        ValueError: An array has the wrong shape, dtype, device or memory layout.
     """
 
     means: Array
@@ -100,11 +100,11 @@ class Gaussians(_Trained):
             check(
                 name,
                 shape == expected,
-                f"shape {expected} to go with means {(num, 3)}, got {shape}",
+                f"shape {expected} to match means of shape {(num, 3)}, got {shape}",
             )
         shape = tuple(self.sh.shape)
         fits = any(shape == (num, count, 3) for count in _NUM_SH)
-        check("sh", fits, f"shape ({num}, K, 3) with K 1, 4, 9 or 16, got {shape}")
+        check("sh", fits, f"shape ({num}, K, 3) with K = 1, 4, 9 or 16, got {shape}")
 
     def __reduce__(self) -> tuple[Callable[..., Gaussians], tuple[object, ...]]:
         return _restored, (list(vars(self).values()), self.antialiased)
@@ -125,8 +125,8 @@ class Gaussians(_Trained):
 
     @property
     def rows(self) -> _core.Rows:
-        """The arrays for the compiled operations, without gradients; they share
-        memory.
+        """The arrays for the compiled operations, without gradients. They share memory
+        with this object.
 
         Tensors on a CUDA device that are not aligned to 16 bytes are copied.
         """
@@ -138,16 +138,16 @@ class Gaussians(_Trained):
         return _core.Rows(*map(_aligned, tensors))
 
     def trained(self, *, antialiased: bool | None) -> Gaussians:
-        """The same gaussians, of which it is known whether they were trained with
-        antialiasing, or not known (None); the arrays are shared.
+        """Return the same gaussians, marked as trained with or without antialiasing, or
+        as unknown (None). The arrays are shared.
 
-        Trainers that antialias draw with a filter and multiply each opacity by
-        sqrt(det before / det after the filter) (Mip-Splatting, eq. 9). Files can say
-        that (docs/formats.md); `v3dg.render` draws such an asset in that way, and
-        `v3dg.write_asset` keeps it.
+        Training with antialiasing draws with a filter and multiplies each opacity by
+        the square root of det(covariance) before / after the filter (Mip-Splatting, eq.
+        9). `v3dg.render` draws such an asset in the same way. Files can declare it
+        (docs/formats.md), and `v3dg.write_asset` writes it.
 
         Raises:
-            TypeError: ``antialiased`` is neither None nor a bool.
+            TypeError: ``antialiased`` is neither a bool nor None.
         """
         if antialiased is not None:
             check_type("antialiased", antialiased, bool, "a bool or None")
@@ -156,17 +156,17 @@ class Gaussians(_Trained):
         return marked
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
-        """Return the gaussians selected by a slice, an array of M indices or a mask of
-        N booleans, in its order.
+        """Return the gaussians selected by a slice, an array of M indices (in their
+        order), or a mask of N booleans.
 
         A slice with step 1 shares memory with this object; all other results are
         copies.
 
         Raises:
-            TypeError: the index is a single number, or not made of integers or
-                booleans.
-            ValueError: the index has more than one dimension.
-            IndexError: an index is out of range, or a mask has another length.
+            TypeError: The index is a single number, or its elements are neither
+                integers nor booleans.
+            ValueError: The index has more than one dimension.
+            IndexError: An index is out of range, or a mask has another length.
         """
         if isinstance(index, slice):
             if index.step not in (None, 1):  # torch does not support negative steps
@@ -198,19 +198,19 @@ class Gaussians(_Trained):
         """Return the gaussians transformed by p -> scale * rotation p + position, with
         rotated colours.
 
-        The result has the same kind and device, without gradients.
+        The result has the same array type and device, without gradients.
 
         Args:
-            quaternion: (4,) w x y z of any length but zero.
-            position: (3,).
-            scale: > 0.
+            quaternion: (4,) rotation as w, x, y, z; it need not be normalised.
+            position: (3,) translation.
+            scale: Uniform scale, > 0.
 
         Raises:
             ValueError: A shape or a value is invalid.
         """
         rotation = vector(quaternion, "quaternion", (4,))
-        check("quaternion", rotation.any(), "a rotation, got a quaternion of zeros")
-        rotation /= np.abs(rotation).max()  # so that squares neither overflow nor underflow
+        check("quaternion", rotation.any(), "a nonzero quaternion, got zeros")
+        rotation /= np.abs(rotation).max()  # prevents overflow and underflow of squares
         rotation /= np.linalg.norm(rotation)
         translation = vector(position, "position")
         moved = Gaussians(
@@ -222,12 +222,12 @@ class Gaussians(_Trained):
 
     @staticmethod
     def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-        """Join sets of gaussians of one SH degree and one kind, in order; whether they
-        are antialiased is known if it is the same for all.
+        """Join gaussians of the same SH degree and array type, in order. `antialiased`
+        is kept if it is the same for all parts, else it is None.
 
         Raises:
-            ValueError: no parts, or parts of different degrees.
-            TypeError: a part is not Gaussians, or NumPy and torch are mixed.
+            ValueError: There are no parts, or they have different SH degrees.
+            TypeError: A part is not Gaussians, or NumPy and torch are mixed.
         """
         check_type("parts", parts, Iterable, "a list of Gaussians")
         parts = list(parts)
@@ -250,18 +250,18 @@ class Gaussians(_Trained):
         return Gaussians(*map(join, columns)).trained(antialiased=antialiased)
 
     def numpy(self) -> Gaussians:
-        """Return the same gaussians as NumPy arrays, without gradients; copied only
-        from another device."""
+        """Return the same gaussians as NumPy arrays without gradients. Only arrays on
+        another device are copied."""
         if not _is_tensor(self.means):
             return self
         return self._map(lambda tensor: tensor.detach().cpu().numpy())
 
     def torch(self, device: str | int | torch.device | None = None) -> Gaussians:
-        """Return the same gaussians as torch tensors on `device`; with None, on their
-        device, and NumPy arrays on the CPU.
+        """Return the same gaussians as torch tensors on `device`. With None, tensors
+        stay on their device and NumPy arrays become tensors on the CPU.
 
-        Arrays are copied only if they move or if a NumPy array is read-only; gradients
-        propagate through a move.
+        Arrays are copied only if they move to another device, or if a NumPy array is
+        read-only. Gradients propagate through such a move.
 
         Raises:
             ValueError: torch does not know the device.
@@ -295,19 +295,19 @@ class Gaussians(_Trained):
 
 
 def _restored(arrays: Sequence[Array], antialiased: bool | None) -> Gaussians:  # noqa: FBT001
-    """Gaussians from what `Gaussians.__reduce__` has."""
+    """Return gaussians from the state that `Gaussians.__reduce__` stores."""
     return Gaussians(*arrays).trained(antialiased=antialiased)
 
 
 def common(values: Sequence[bool | None]) -> bool | None:
-    """The value of all of them; None if there are several or none."""
+    """Return the value if all are equal; None if they differ or there are none."""
     if len(set(values)) == 1:
         return values[0]
     return None
 
 
 def _aligned(tensor: Array) -> Array:
-    """Return the tensor, or a copy if it is not aligned to 16 bytes."""
+    """Return a tensor, or a copy of it if its memory is not aligned to 16 bytes."""
     if tensor.data_ptr() % 16 == 0:
         return tensor
     return tensor.clone()
@@ -325,13 +325,13 @@ def empty(count: int, sh_degree: int) -> Gaussians:
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Return the size of one gaussian in memory."""
+    """Return the size of one gaussian in memory, in bytes."""
     return 4 * sum(map(math.prod, shapes_of(1, sh_degree)))
 
 
 def put(part: Gaussians, out: Gaussians, row: int) -> None:
-    """Copy gaussians on the host into others of the same or a higher SH degree, from
-    ``row`` on."""
+    """Copy gaussians on the host into others of the same or a higher SH degree,
+    starting at index ``row``."""
     for name, values in vars(part).items():
         target = getattr(out, name)[row : row + len(part)]
         if name == "sh":
@@ -345,12 +345,14 @@ def _dtype_name(array: Array) -> str:
 
 
 def _check_kind(name: str, array: Array, first: Array) -> None:
-    """Raise unless `array` is contiguous, float32 (tensors: or float64), and of the
-    kind and device of `first`."""
+    """Raise an error unless `array` is contiguous, has the type and the device of
+    `first`, and is float32 (tensors may be float64)."""
     if not isinstance(array, np.ndarray) and not _is_tensor(array):
         raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {_kind(array)}")
     if _is_tensor(array) != _is_tensor(first):
-        raise TypeError(f"{name}: expected {_kind(first)} like the others, got {_kind(array)}")
+        raise TypeError(
+            f"{name}: expected {_kind(first)} like the other arrays, got {_kind(array)}"
+        )
     expected_dtype = "float32"
     if _is_tensor(array) and _dtype_name(first) == "float64":
         expected_dtype = "float64"
@@ -358,7 +360,7 @@ def _check_kind(name: str, array: Array, first: Array) -> None:
     check(name, dtype == expected_dtype, f"dtype {expected_dtype}, got {dtype}; convert it first")
     if _is_tensor(array):
         is_there = array.device == first.device
-        check(name, is_there, f"device {first.device} like the others, got {array.device}")
+        check(name, is_there, f"device {first.device} like the other arrays, got {array.device}")
         check(
             name,
             array.is_contiguous(),
@@ -370,8 +372,8 @@ def _check_kind(name: str, array: Array, first: Array) -> None:
 
 
 def _checked_index(index: Array) -> Array:
-    """Return a mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy
-    array."""
+    """Return a mask or int64 indices, as a tensor if ``index`` is one, otherwise as a
+    NumPy array."""
     array: Array
     if _is_tensor(index):
         array = index.detach()
@@ -386,7 +388,7 @@ def _checked_index(index: Array) -> Array:
     if not dtype.startswith(("int", "uint", "bool")):
         raise TypeError(f"{expected}, got {_kind(index)} of dtype {dtype}")
     is_meta = _is_tensor(array) and array.is_meta
-    check("index", not is_meta, "a tensor with data, got one on the device meta")
+    check("index", not is_meta, "a tensor with data, got one on the meta device")
     check("index", array.ndim == 1, f"one dimension, got shape {tuple(array.shape)}")
     if _is_tensor(array):
         if dtype == "bool":
@@ -398,8 +400,8 @@ def _checked_index(index: Array) -> Array:
 
 
 def _check_range(index: Array, count: int) -> None:
-    """Raise IndexError for a tensor with indices out of range; on a CUDA device,
-    indexing with them would destroy the context."""
+    """Raise IndexError if a tensor of indices is out of range. On a CUDA device, using
+    such indices would make the CUDA context unusable."""
     if str(index.dtype) == "torch.bool" or len(index) == 0:
         return
     for number in (int(index.max()), int(index.min())):

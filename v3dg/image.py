@@ -1,4 +1,4 @@
-"""Image: the result of drawing."""
+"""Pictures as results of drawing, and their statistics."""
 
 import os
 from collections.abc import Callable
@@ -24,10 +24,11 @@ class Image:
     it.
 
     Attributes:
-        color: (H, W, 3) premultiplied colour, the background composed last.
-        alpha: (H, W) coverage.
-        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn;
-            an AttributeError unless it was requested.
+        color: (H, W, 3) colour of the gaussians over the background; on black, this is
+            premultiplied colour.
+        alpha: (H, W) opacity of all gaussians together, without the background.
+        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn.
+            Raises AttributeError unless it was requested.
     """
 
     def __init__(self, color: Array, alpha: Array, depth: Array | None) -> None:
@@ -38,18 +39,18 @@ class Image:
         return self._drawn
 
     def _repr_png_(self) -> bytes:
-        """The picture, for notebooks."""
+        """Return the picture as PNG for notebooks."""
         return encode_png(self.color)
 
     def save(self, path: str | os.PathLike[str], *, transparent: bool = False) -> None:
         """Write the picture as .png or .jpg; its folder is created if needed.
 
         Args:
-            transparent: Write a PNG with straight alpha, of a picture that was drawn on
-                black, which is the default background.
+            transparent: Whether to write a PNG with straight alpha. The picture must
+                have been drawn on black, the default background.
 
         Raises:
-            ValueError: The suffix is another one, or the background is not black.
+            ValueError: The suffix is unknown, or the background is not black.
             OSError: The file cannot be written.
         """
         alpha = None
@@ -70,7 +71,7 @@ class Image:
         depth = self._planes.depth
         if depth is None:
             raise AttributeError(
-                "depth: expected a picture that was drawn with depth=True, got one without"
+                "depth: expected a picture that was drawn with depth=True, got one without depth"
             )
         return depth
 
@@ -79,23 +80,22 @@ class Stats(NamedTuple):
     """Costs of drawing a picture.
 
     Attributes:
-        gaussians_selected: Gaussians of the selected clusters.
-        gaussians_in_frustum: Selected gaussians in front of the near plane whose extent
-            meets the image, before any finer culling.
-        tolerance: Largest screen area, px², that one gaussian of a coarser cluster
-            stands for; with a budget, the area at which the budget is met; 0 for an
-            asset.
-        select_ms: Time of the selection.
-        draw_ms: Time of drawing.
-        levels: Selected gaussians by level; empty on CUDA, for an asset, and for a cut
-            that the caller passed.
-        missing: Pages that the picture needs and that are not resident, so that coarser
-            ones are drawn instead; 0 where everything is resident, or the renderer has
-            settled. `missing` and `failed` count what is known when the picture is
-            drawn.
-        failed: Pages that cannot be read.
-        bytes_in: Bytes of pages that came in with this picture.
-        memory: Size of the pool in bytes; None where everything is resident.
+        gaussians_selected: Number of gaussians in the selected clusters.
+        gaussians_in_frustum: Number of selected gaussians that are behind the near
+            plane and whose extent intersects the image. Some of them may be culled
+            later.
+        tolerance: Tolerance of the cut, px² per gaussian (see `v3dg.select`); with a
+            budget, the tolerance that meets it; 0 for an asset.
+        select_ms: Time of the selection in ms.
+        draw_ms: Time of drawing in ms.
+        levels: Number of selected gaussians of each level; empty on CUDA, for an asset,
+            and for a cut that the caller passed.
+        missing: Number of pages that the picture needs but that are not resident, so
+            that coarser ones are drawn instead; 0 if everything is resident, or after
+            `Renderer.settle`. `missing` and `failed` are counted when drawing begins.
+        failed: Number of pages that cannot be read.
+        bytes_in: Number of bytes of the pages that became resident with this picture.
+        memory: Size of the pool in bytes; None if everything is resident.
     """
 
     gaussians_selected: int
@@ -111,13 +111,13 @@ class Stats(NamedTuple):
 
 
 class RenderedImage(Image):
-    """An `Image` with the costs of drawing it.
+    """An `Image` with statistics about its drawing.
 
-    CUDA may still be drawing it; reading an attribute waits for the end, and raises the
-    error of the drawing.
+    CUDA may still be drawing the picture. Reading an attribute waits until the picture
+    is finished, and raises an error if drawing failed.
 
     Attributes:
-        stats: The costs of drawing it.
+        stats: The costs of drawing the picture.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class RenderedImage(Image):
     @property
     def _planes(self) -> _core.Drawing | _core.Picture:
         if self._drawing.finish().exceeds_budget:
-            self._finish()  # raises the error
+            self._finish()  # raises an error
         if self._is_right:
             return self._drawing.right
         return self._drawing

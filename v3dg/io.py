@@ -1,4 +1,5 @@
-"""Reads and writes gaussians by file name; each format is a module of v3dg.formats."""
+"""Reads and writes assets. The end of a file's name selects the format, a module of
+v3dg.formats."""
 
 import os
 import pathlib
@@ -41,7 +42,7 @@ from v3dg.gaussians import Gaussians
 Format = TypeVar("Format")
 _Reader: TypeAlias = Callable[[AnyPath], AssetFile]
 
-# Readers by the end of a file's name; the first that matches is used.
+# Functions that open files, by the end of the file's name; the first match is used.
 _READERS: dict[str, _Reader] = {
     ".ply": ply.open_file,
     ".splat": splat.open_file,
@@ -63,10 +64,10 @@ _WRITERS: dict[str, Callable[..., None]] = {
     **dict.fromkeys(usd.SUFFIXES, usd.write),
     ".sog": sog.write,
 }
-# Ends of the names of files that have axes, to which gaussians are turned, and the axis
-# that is up there.
+# For ends of file names of formats with axes, to which gaussians are converted: the
+# axis that points up in the file.
 _UP: dict[str, Axis] = dict.fromkeys((".spz", ".glb", *usd.SUFFIXES), "y")
-# Functions that list the files of an asset that may have several.
+# Functions that list all files of an asset, by the end of the file's name.
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
     "meta.json": sog.files,
@@ -74,16 +75,16 @@ _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "": lambda path: [path],
 }
 
-# Ends of the names of packed files, what these can hold, and the order that they put
-# gaussians in.
+# For ends of file names of quantised formats: the ranges of values, and the order of
+# gaussians in the file.
 _PACKED: dict[str, tuple[Limits, Callable[[Gaussians], NDArray[np.int64]]]] = {
     ".compressed.ply": (compressed_ply.LIMITS, compressed_ply.chunk_order),
     ".spz": (spz.LIMITS, file_order),
     ".sog": (Limits(), curve_order),
 }
 
-# Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the
-# 3DGS paper writes.
+# Checkpoints of gsplat (one for each GPU) and of nerfstudio, and the files that the
+# code of the 3DGS paper writes.
 _RUNS = (
     "ckpts/ckpt_*.pt",
     "nerfstudio_models/step-*.ckpt",
@@ -91,16 +92,16 @@ _RUNS = (
 )
 
 SUFFIXES = tuple(_READERS)
-"""Ends of the names of files that `read_asset` reads."""
+"""The ends of file names that `read_asset` accepts."""
 
 WRITE_SUFFIXES = tuple(_WRITERS)
-"""Ends of the names of files that `write_asset` writes."""
+"""The ends of file names that `write_asset` accepts."""
 
 
 def subject_name(path: AnyPath) -> str:
     """Return the name of the subject in a file or at a URL: the file's name without its
-    suffix, or the folder's name if all files of that kind have the same name, such as
-    `lod-meta.json`."""
+    suffix. For a file whose name is always the same, such as `lod-meta.json`, it is the
+    name of the folder."""
     file = beside(path)
     if file.name.lower() in ("lod-meta.json", "meta.json"):
         folder = folder_of(path)
@@ -113,42 +114,42 @@ def read_asset(path: AnyPath) -> Gaussians:
     """Read an asset; the end of the file's name determines the format
     (docs/formats.md):
 
-    - `.ply`, as trainers write it: ascii or binary of either byte order, its properties
-      in any order and of any scalar type, among others that are ignored, for SH degree
-      0 to 3. Files hold log scales and logit opacities; memory gets values, each
-      computed in double precision and rounded once. Quaternions are normalised, except
-      those of length zero, which stay as they are. Values that are not finite are
-      passed on. Little more memory is needed than for the result. A compressed `.ply`,
-      of PlayCanvas and SuperSplat, is recognised by its content.
-    - `.glb` and `.gltf`, glTF with KHR_gaussian_splatting, also compressed as `.spz`:
-      the gaussians of the scene, where its nodes place them; the leaves of `.hier`, of
-      H3DG.
-    - `.usd`, `.usda`, `.usdc` and `.usdz`, OpenUSD, with the extra `usd`, whose library
-      bounds what is read.
+    - `.ply`, as trainers write it, of SH degree 0 to 3: ascii, or binary of either byte
+      order. Properties may be in any order and of any scalar type; other properties are
+      ignored. Log scales and opacity logits are converted in double precision and
+      rounded once. Quaternions are normalised, except zero quaternions, which stay
+      zero. Values that are not finite are kept. Reading needs little more memory than
+      the result. A compressed `.ply`, of PlayCanvas and SuperSplat, is recognised by
+      its content.
+    - `.glb` and `.gltf`, glTF with KHR_gaussian_splatting, also with embedded `.spz`:
+      the gaussians of the scene, placed by its nodes.
+    - `.usd`, `.usda`, `.usdc` and `.usdz`, OpenUSD. This needs the extra `usd`, and its
+      library determines which files can be read.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
-      to 4; `.sog` of PlayCanvas, version 2, or the `meta.json` of one that is not in a
-      zip; the finest level of streamed SOG, by its `lod-meta.json`.
+      to 4; `.sog`, of PlayCanvas, version 2, or the `meta.json` of an unpacked one;
+      `lod-meta.json` of a streamed SOG, of which the finest level is read; `.hier`, of
+      H3DG, of which the leaves are read.
     - `.pt`, `.ckpt` and `.pth`, checkpoints of gsplat's trainer, of nerfstudio's
-      splatfacto and of the code of the 3DGS paper and 2DGS, from which nothing but
-      tensors is taken.
+      splatfacto and of the code of the 3DGS paper and 2DGS. Only tensors are read; no
+      code of the pickle is run.
 
-    A file whose bytes are those of another of these formats is read as such.
+    If the content of a file is recognised as another of these formats than its name
+    says, the content decides.
 
-    Whether the gaussians were trained with antialiasing is read from the files that can
-    say it, see `Gaussians.antialiased`.
+    If the file declares whether the gaussians were trained with antialiasing,
+    `Gaussians.antialiased` of the result has that value.
 
-    With the extra `fsspec`, the file may be at a URL, which is fetched once per
-    process, unless it refers to other files.
+    With the extra `fsspec`, the file may be at a URL, unless it refers to other files.
+    It is downloaded once per process.
 
-    Files of formats that have axes (`.spz`, glTF, OpenUSD) are turned, with their
-    harmonics, to those of trainers' `.ply`: right, down, forward. Coordinates of all
-    others are those of the file. What a file declares that was not understood is a
-    `v3dg.cleaning.AssetWarning` each. Memory and time are bounded by the size of the
-    file (docs/robustness.md).
+    Gaussians of formats with defined axes (`.spz`, glTF, OpenUSD) are rotated,
+    including their harmonics, to the axes of trainers' `.ply`: right, down, forward.
+    All other formats keep the coordinates of the file. Each part of the content that is
+    ignored or converted causes a `v3dg.cleaning.AssetWarning`. Memory and time are
+    bounded by the size of the file (docs/robustness.md).
 
     Raises:
-        ValueError: The name is unknown, or the content does not match it; the message
-            says what was expected and what was found.
+        ValueError: The end of the name is unknown, or the content is invalid.
         OSError: The file cannot be opened or read (FileNotFoundError,
             IsADirectoryError, ...).
     """
@@ -160,18 +161,18 @@ def read_asset(path: AnyPath) -> Gaussians:
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
-    """Return an asset, after reading it if a file is given."""
+    """Return an asset; if it is a file, read it first."""
     if isinstance(asset, str | os.PathLike):
         return read_asset(asset)
     return asset
 
 
 def open_asset(path: AnyPath) -> AssetFile:
-    """Open an asset of any kind that `read_asset` reads, to read it in parts; errors as
-    there.
+    """Open an asset in any format of `read_asset` for reading it in parts. The errors
+    are those of `read_asset`.
 
-    `.ply`, `.splat` and `.compressed.ply` are read row by row. Of the others, reading
-    the first rows takes the memory for all.
+    `.ply`, `.splat` and `.compressed.ply` are read row by row. For other formats, the
+    first read loads all rows.
     """
     reader = _by_name(path, _READERS)
     at_url = in_parts(path)
@@ -182,35 +183,37 @@ def open_asset(path: AnyPath) -> AssetFile:
 
 
 def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...]]:
-    """The reader of a file whose bytes may be those of another format than its name
-    says, and a note that then says so. ValueError if they are those of a format that is
-    not read."""
+    """Return the function that opens a file. If the content is of another format than
+    the name says, it is the function for the content, with a note; if no reader
+    supports the content, raise ValueError."""
     content = content_of(path)
     if content is None or _READERS.get(content.suffix) is reader:
         return reader, ()
     name = beside(path).name.lower()
     ending = next(ending for ending in _READERS if name.endswith(ending))
-    is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
+    # USD chooses the encoding by the suffix.
+    is_readable = content.suffix not in ("", *usd.SUFFIXES)
     check(path, is_readable, f"a {ending}, got {content.text}")
-    note = f"Its name ends in {ending}, but it is {content.text}, and was read as such."
+    note = f"The name ends in {ending}, but the file is {content.text}; it was read as such."
     return _READERS[content.suffix], (note,)
 
 
 def _noted(file: AssetFile, notes: tuple[str, ...]) -> AssetFile:
-    """The file, with notes in front of its own."""
+    """Return the file with some notes in front of its own notes."""
     return replace(file, declared=replace(file.declared, notes=(*notes, *file.declared.notes)))
 
 
 def _open_fetched(at_url: FileAtUrl, reader: _Reader) -> AssetFile:
-    """An asset at a URL, whose local copy exists as long as this object; errors name
-    the URL."""
+    """Return an asset at a URL. The local copy exists as long as the result; errors
+    name the URL."""
     with reading(at_url) as local:
         reader, notes = _by_content(local, reader)
         if reader is gltf.open_file:
-            # Nothing that a document at a URL names is read, here or there.
+            # Files to which a document at a URL refers are read neither from the server
+            # nor from this machine.
             is_alone = len(gltf.files(pathlib.Path(local))) == 1
-            expected = "the URL of an asset in one file, got one that names others"
-            check(shown(at_url), is_alone, f"{expected}; fetch the folder")
+            expected = "the URL of an asset in one file, got one that refers to other files"
+            check(shown(at_url), is_alone, f"{expected}; download its folder")
         file = _noted(reader(local), notes)
         whole = None
         if at_url.needs_name:
@@ -226,8 +229,8 @@ def _open_fetched(at_url: FileAtUrl, reader: _Reader) -> AssetFile:
 
 
 def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Return the last checkpoint of a run of gsplat, nerfstudio or the code of the 3DGS
-    paper; its files are one asset."""
+    """Return the files of the last checkpoint of a run of gsplat, nerfstudio or the
+    code of the 3DGS paper. Together they are one asset."""
     steps: dict[int, list[pathlib.Path]] = {}
     for pattern in _RUNS:
         for file in sorted(folder.glob(pattern)):
@@ -242,8 +245,8 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def asset_bytes(path: AnyPath) -> int:
-    """Return the size on disk of a readable asset, including the existing files that it
-    names."""
+    """Return the size in bytes of a readable asset, including all existing files to
+    which it refers."""
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
@@ -260,42 +263,42 @@ def write_asset(
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
 ) -> None:
-    """Write an asset; an existing file is replaced in one step once everything is
-    written.
+    """Write an asset. An existing file is replaced only when the new one is complete.
 
-    The end of the name determines the format (docs/formats.md lists what each one
-    loses):
+    The end of the name selects the format (docs/formats.md lists the losses of each):
 
     - `.ply`: the original layout without its normals, which are always zero: x y z,
       f_dc, f_rest (channel by channel), opacity (logit), scale (log), rot. An opacity
-      of 1 is written as logit 20 and of 0 as logit -110, a scale of 0 as log -110:
-      finite, and they read back as exactly 1, 0 and 0.
-    - `.compressed.ply`: 16 bytes a gaussian and one a coefficient of higher SH. The
-      order changes.
-    - `.spz`: version 3, or another.
-    - `.glb`: glTF 2.0 with KHR_gaussian_splatting, of float32 numbers.
-    - `.usd`, `.usda`, `.usdc`, `.usdz`: OpenUSD, a ParticleField3DGaussianSplat of
-      float32 numbers.
-    - `.sog`: version 2. The order changes.
+      of 1 is written as the logit 20, an opacity of 0 as the logit -110, and a scale of
+      0 as the logarithm -110. These are finite, and are read back as exactly 1, 0 and
+      0.
+    - `.compressed.ply`: 16 bytes per gaussian, and one byte per coefficient of higher
+      SH. Gaussians are reordered.
+    - `.spz`: version 3, or the given `version`.
+    - `.glb`: glTF 2.0 with KHR_gaussian_splatting, in float32.
+    - `.usd`, `.usda`, `.usdc`, `.usdz`: OpenUSD, one ParticleField3DGaussianSplat in
+      float32.
+    - `.sog`: version 2. Gaussians are reordered.
 
-    Gaussians are turned so that what is up is y in `.spz`, `.glb` and OpenUSD; the
-    other formats have no axes, and are written as the gaussians are.
+    For `.spz`, `.glb` and OpenUSD, gaussians are rotated so that y points up. The other
+    formats have no defined axes, so coordinates are written unchanged.
 
     Args:
-        gaussians: The asset, or its file.
-        up: The axis that is up among the gaussians; -y as in most trained assets, and
-            in all that `read_asset` has turned.
-        antialiased: Whether the gaussians were trained with antialiasing, which the
-            file then declares (docs/formats.md); None for what the gaussians say, see
-            `Gaussians.trained`.
+        gaussians: The asset, or the path of its file.
+        up: The axis of the gaussians that points up: -y in most trained assets, and in
+            all that `read_asset` has rotated.
+        antialiased: Whether the gaussians were trained with antialiasing. The file
+            declares it, if its format can (docs/formats.md). None uses
+            `Gaussians.antialiased`.
         encoding: Encoding of a `.ply`; other formats have only one.
-        version: Version of a `.spz`; 3 if None. Version 2 is for viewers from before
-            2025, 4 for those since 2026.
+        version: Version of a `.spz`; 3 if None. Viewers from before 2025 need version
+            2; version 4 needs viewers from 2026 or later.
 
     Raises:
-        ValueError: The name or the encoding is unknown, or the format cannot hold a
-            value: a negative scale or an opacity outside [0, 1]; in all formats but
-            `.ply` also values that are not finite, and quaternions of length zero.
+        ValueError: The end of the name or the encoding is unknown, or the format cannot
+            represent a value: a negative scale or an opacity outside [0, 1]. All
+            formats except `.ply` also reject values that are not finite and zero
+            quaternions.
         OSError: The file cannot be written.
     """
     gaussians = loaded(gaussians)
@@ -307,14 +310,17 @@ def write_asset(
         check(
             "version",
             write is spz.write,
-            f"None for {os.fspath(path)}, which is not a .spz, got {version}",
+            f"None for {os.fspath(path)}, which is not a .spz, got {version}; leave it out",
         )
         write = partial(spz.write, version=version)
     if write is ply.write:
         one_of(encoding, "encoding", get_args(PlyEncoding))
         write = partial(ply.write, encoding=encoding)
     else:
-        expected = f"the default for {os.fspath(path)}, which is not a .ply, got {encoding!r}"
+        expected = (
+            f"the default for {os.fspath(path)}, which is not a .ply, got {encoding!r}; leave it "
+            "out"
+        )
         check("encoding", encoding == "binary_little_endian", expected)
     one_of(up, "up", AXES)
     if turned_up(path) is not None:
@@ -323,17 +329,17 @@ def write_asset(
 
 
 def turned_up(path: AnyPath) -> Axis | None:
-    """Return the axis that is up in a file that `write_asset` writes, by its name; None
-    for formats without axes."""
+    """Return the axis that points up in a file that `write_asset` writes, by the file's
+    name; None for formats without defined axes."""
     return _of_name(path, _UP)
 
 
 def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> Losses | None:
-    """Read back the file that `write_asset` wrote, and return what it lacks of the
-    gaussians; None for formats of float32 numbers, which lose nothing.
+    """Read back a file written by `write_asset`, and return how its gaussians differ
+    from the original ones; None for lossless formats.
 
     Args:
-        up: As it was given to `write_asset`.
+        up: The value that was passed to `write_asset`.
     """
     packed = _of_name(path, _PACKED)
     if packed is None:
@@ -348,8 +354,8 @@ def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP
 
 
 def _of_name(path: AnyPath, formats: Mapping[str, Format]) -> Format | None:
-    """Return what a table has for the first of its endings that a file's name has; None
-    without one."""
+    """Return the value in a table for the end of a file's name, the first match; None
+    if no end matches."""
     name = beside(path).name.lower()
     for ending, value in formats.items():
         if name.endswith(ending):
@@ -358,7 +364,7 @@ def _of_name(path: AnyPath, formats: Mapping[str, Format]) -> Format | None:
 
 
 def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
-    """Return what `_of_name` does; ValueError if the name has none of the endings."""
+    """Return the result of `_of_name`; raise ValueError if no end matches."""
     value = _of_name(path, formats)
     if value is not None:
         return value
@@ -369,7 +375,7 @@ def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
         if content is not None:
             advice = f"; this is {content.text}"
         if content is not None and content.suffix:
-            advice += ", so let its name end so"
+            advice += ", so rename it to end in that"
     raise ValueError(
         f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}"
     )

@@ -1,4 +1,5 @@
-"""Differences of two pictures: PSNR, SSIM and FLIP; FLIP needs the extra `flip`.
+"""Measures the difference between two pictures: PSNR, SSIM and FLIP. FLIP needs the
+extra `flip`.
 
 Every function takes a reference and a test picture (H,W,3) with display values in [0,1]
 (sRGB as shown, not linear light), as NumPy arrays or torch tensors, and returns the
@@ -22,19 +23,19 @@ from v3dg.render import render
 from v3dg.scene import Subject
 
 FLIP_PIXELS_PER_DEGREE = 67.0
-"""Pixels per degree of a 0.7 m wide 4K display seen from 0.7 m, the viewing condition
-of FLIP's authors."""
+"""Pixels per degree of a 0.7 m wide 4K display seen from a distance of 0.7 m, the
+viewing condition in the paper of FLIP."""
 
 MIN_TRANSMITTANCE = 1e-4
-"""Transmittance at which pixels of the reference stop, a tenth of that of other
+"""Transmittance at which pixels of reference pictures stop: a tenth of that of other
 pictures."""
 
 FLIP_MISSING = _extras.missing("flip_evaluator")
 
 
 def _pair(reference: Array, test: Array) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return both pictures as `pictures.checked` does; raise ValueError unless they are
-    floats of equal size."""
+    """Return both pictures as NumPy arrays; raise ValueError unless they have floats
+    and the same size."""
     a = checked("reference", reference)
     b = checked("test", test)
     for name, dtype in (("reference", a.dtype), ("test", b.dtype)):
@@ -46,11 +47,11 @@ def _pair(reference: Array, test: Array) -> tuple[NDArray[np.floating], NDArray[
 
 
 def psnr(reference: Array, test: Array) -> float:
-    """Compute the peak signal-to-noise ratio in dB, for a peak of 1; infinite for equal
-    pictures.
+    """Compute the peak signal-to-noise ratio in dB, for a peak of 1; it is infinite for
+    equal pictures.
 
-    Values are not clipped: clip both pictures to [0,1] first to compare what a screen
-    shows.
+    Values are not clipped. Clip both pictures to [0,1] first to compare them as shown
+    on a screen.
     """
     a, b = _pair(reference, test)
     difference = a.astype(np.float64) - b
@@ -61,11 +62,12 @@ def psnr(reference: Array, test: Array) -> float:
 
 
 def ssim(reference: Array, test: Array) -> float:
-    """Compute the structural similarity, 1 for equal pictures.
+    """Compute the structural similarity (SSIM), which is 1 for equal pictures.
 
-    Convention (others differ in the third digit): Gaussian window of 11×11 px with
-    sigma 1.5 px, population variances, mirrored border, mean over all pixels and
-    channels, values in [0,1] without clipping.
+    The window is a Gaussian of 11×11 px with a standard deviation of 1.5 px. Variances
+    are those of the population, borders are mirrored, and the result is the mean over
+    all pixels and channels. Values are not clipped. With other conventions the third
+    digit differs.
 
     Raises:
         ValueError: A side is shorter than 6 px, which is less than half a window.
@@ -87,7 +89,7 @@ def has_flip() -> bool:
 
 def _flip(reference: Array, test: Array, *, magma: bool) -> NDArray[np.float32]:
     flip_evaluator = _extras.load("flip_evaluator")
-    # These are new arrays, because the evaluator may write into its arguments.
+    # The arrays are new, because the evaluator may write into its arguments.
     a, b = (
         np.clip(picture, 0, 1).astype(np.float32, order="C") for picture in _pair(reference, test)
     )
@@ -117,14 +119,14 @@ def flip(reference: Array, test: Array) -> float:
 
 
 def error_image(reference: Array, test: Array) -> NDArray[np.float32]:
-    """Draw `flip_map` in the magma colours that are common for FLIP, (H,W,3): black
-    means no difference."""
+    """Return `flip_map` in the magma colours that are customary for FLIP, (H,W,3);
+    black means no difference."""
     return _flip(reference, test, magma=True)
 
 
 def box_downsample(image: Array, factor: int) -> Array:
-    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...),
-    with the same kind of array.
+    """Average blocks of ``factor`` × ``factor`` pixels: (H,W,...) to
+    (H/factor,W/factor,...). The type of the array is kept.
 
     Raises:
         ValueError: ``factor`` is not positive, or does not divide the height and the
@@ -142,8 +144,8 @@ def box_downsample(image: Array, factor: int) -> Array:
 
 
 def errors_of(reference: Picture, test: Picture) -> dict[str, float | None]:
-    """Return FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of
-    8-bit pictures."""
+    """Return the FLIP (None without the extra `flip`), the PSNR (None for equal
+    pictures) and the SSIM of two 8-bit pictures."""
     a, b = (picture.astype(np.float32) / np.float32(255) for picture in (reference, test))
     errors: dict[str, float | None] = {"flip": None, "psnr": None, "ssim": ssim(a, b)}
     if has_flip():
@@ -160,10 +162,10 @@ def draw_truth(
     supersampling: int = 2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Picture:
-    """Draw the 8-bit reference picture of comparisons from all gaussians.
+    """Draw all gaussians of a subject as an 8-bit reference picture for comparisons.
 
-    A pixel has ``supersampling`` × ``supersampling`` samples. Each sample is clipped to
-    [0,1], as on a screen, before the average over the pixel.
+    A pixel is the average of ``supersampling`` × ``supersampling`` samples. Each sample
+    is clipped to [0,1] first, as on a screen.
     """
     image = render(
         subject,

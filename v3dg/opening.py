@@ -1,4 +1,4 @@
-"""Opening of files by their names: scenes, bundles and assets."""
+"""Opens the files of scenes, bundles and assets."""
 
 import os
 from pathlib import Path
@@ -15,16 +15,15 @@ from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene, read_scene
 
 File: TypeAlias = str | os.PathLike[str]
-"""The name of a file, which functions accept instead of the subject that `open` returns
-for it."""
+"""A path that functions accept in place of a subject; they open it with `open`."""
 
 
 def open(path: str | os.PathLike[str]) -> Subject:
-    """Open a file by its name: a scene (.json), a bundle (.v3dg) or an asset, as
-    `read_asset` does.
+    """Open a file: a scene (.json), a bundle (.v3dg), or an asset in any format of
+    `read_asset`. The end of the name decides.
 
     `read_scene` also returns the cameras of a scene. An OpenUSD file with instances is
-    a scene, see `read_usd_scene`.
+    opened as a scene, see `read_usd_scene`.
 
     Raises:
         ValueError: The content does not match the name of the file, or the name is
@@ -35,16 +34,20 @@ def open(path: str | os.PathLike[str]) -> Subject:
 
 
 def opened(subject: object) -> Any:
-    """Return the subject in a file; anything but a file name is returned unchanged."""
+    """Return the subject in a file; return anything other than a file name
+    unchanged."""
     if isinstance(subject, str | os.PathLike):
         return open(subject)
     return subject
 
 
 def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
-    """Return a scene with its cameras, or a bundle or an asset, which have none."""
+    """Return a scene with its cameras; or a bundle or an asset, with None."""
     if is_scene(path):
-        expected = "a scene that is here, got a URL; fetch it with the files that it names"
+        expected = (
+            "a scene on this machine, got a URL; download it together with the files that it "
+            "refers to"
+        )
         check(shown(path), not is_url(path), expected)
         return read_scene(path)
     if beside(path).suffix == ".v3dg":
@@ -60,12 +63,12 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
 def read_usd_scene(
     path: str | os.PathLike[str], *, config: BuildConfig | None = None, device: str = "auto"
 ) -> Scene:
-    """Read a world of OpenUSD: a bundle is built from each asset in it, and placed at
-    the poses of its instances.
+    """Read an OpenUSD file as a scene: build a bundle from each asset in the file, and
+    place it at the poses of its instances.
 
     Instances are those of PointInstancers, which may be nested, and prims that refer to
-    the same gaussians; any other prim is a single instance. The finest of their levels
-    is read. Needs the extra `usd`.
+    the same gaussians. Any other prim of gaussians is a single instance. Only the
+    finest level of detail is read. Needs the extra `usd`.
 
     Args:
         config: Settings of the builds; None builds levels without fitting them, which

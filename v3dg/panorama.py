@@ -1,8 +1,9 @@
-"""Pictures of all directions from one point, in the equirectangular projection.
+"""Draws panoramas: pictures of all directions from one point, in the equirectangular
+projection.
 
-Twenty-six pinhole pictures that overlap are resampled with bilinear interpolation and
-blended where they overlap, so that no seam shows where the projections of a gaussian
-differ from one picture to the next.
+Twenty-six overlapping pinhole pictures (sides) are resampled with bilinear
+interpolation and blended where they overlap. The blending hides seams, at which the
+projection of a gaussian changes from one picture to the next.
 """
 
 import itertools
@@ -17,17 +18,17 @@ from v3dg.cameras import Camera, VectorLike, rigid
 from v3dg.image import Image
 from v3dg.pictures import MOST_SIDE
 
-# Tangents of half a side's field of view, 64 degrees, and of the angle from which on a
-# side is blended with its neighbours.
+# Tangents of half the field of view of a side (64 degrees), and of the angle beyond
+# which a side is blended with its neighbours.
 _REACH = 0.625
 _UNBLENDED = 0.325
-# Pixels of a side for one of the panorama, in the middle of the side.
+# Number of pixels of a side for each pixel of the panorama, in the middle of the side.
 _DENSITY = 1.4
-_ROWS = 256  # that are resampled at once
+_ROWS = 256  # number of rows that are resampled at once
 
-# Longitudes and latitudes, in degrees, to which the middles of the sides point. The
-# projection of a gaussian is exact in the middle of a side only, so many narrow sides
-# are far nearer to the truth than the six of a cube.
+# Longitude and latitude, in degrees, of the middle of each side. The projection of a
+# gaussian is exact only in the middle of a side, so many narrow sides are far more
+# precise than the six of a cube.
 _MIDDLES = [(0, 90), (0, -90), *itertools.product(range(0, 360, 45), (-45, 0, 45))]
 
 
@@ -36,21 +37,21 @@ def draw_panorama(
 ) -> Image:
     """Draw all directions around a camera as an equirectangular picture.
 
-    Columns are longitudes: the middle is where the camera looks, the right end half a
-    turn to its right. Rows are latitudes, from `up` in the first to the opposite in the
-    last.
+    Columns are longitudes: the camera looks at the middle column, and the last column
+    is half a turn to its right. Rows are latitudes, from `up` in the first row to the
+    opposite direction in the last.
 
-    The projection of a gaussian is exact in the middle of a pinhole picture and off
-    towards its borders, most for wide gaussians close by. In a captured and a made
-    room, PSNR is 32 and 34 dB against pictures of 15 degrees each, and would be 22 and
-    30 dB with the six sides of a cube.
+    The projection of a gaussian is exact in the middle of a pinhole picture and less
+    exact towards its borders, above all for large gaussians close to the camera.
+    Compared with pictures of 15 degrees, PSNR is 32 dB in a captured room and 34 dB in
+    a synthetic one; with the six sides of a cube it would be 22 and 30 dB.
 
     Args:
         draw: Draws the picture of a pinhole camera, such as a `Renderer`'s `render`.
-        camera: Its position, its direction, of which only the azimuth counts, and its
-            near plane are used.
+        camera: The camera whose position, azimuth and near plane are used.
         up: (3,) direction in the world.
-        width: Of the picture in px, even and at least 8; it is half as high.
+        width: Width of the picture in px, even and at least 8. The height is half of
+            it.
 
     Returns:
         An image of NumPy arrays, without depth.
@@ -81,7 +82,7 @@ def draw_panorama(
 
 
 def _side(longitude: float, latitude: float) -> Floats:
-    """Return (3, 3) the right, down and forward axes of a side, in the frame of the
+    """Return the right, down and forward axes (3, 3) of a side, in the frame of the
     panorama."""
     sine = math.sin(longitude)
     cosine = math.cos(longitude)
@@ -93,14 +94,18 @@ def _side(longitude: float, latitude: float) -> Floats:
 
 
 def _level_frame(camera: Camera, up: Floats) -> Floats:
-    """Return the (3, 3) rotation from the world to the panorama's frame: -y is up, and
-    z is the camera's direction, made horizontal."""
-    check("up", up.any(), "a direction, got (0, 0, 0)")
-    axis = up / np.abs(up).max()  # squares neither overflow nor underflow
+    """Return the (3, 3) rotation from the world to the panorama's frame, in which -y is
+    up and z is the horizontal direction of the camera."""
+    check("up", up.any(), "a direction other than zero, got (0, 0, 0)")
+    axis = up / np.abs(up).max()  # prevents overflow and underflow of squares
     axis /= np.linalg.norm(axis)
     forward = camera.viewmat[2, :3] - axis * (camera.viewmat[2, :3] @ axis)
     length = np.linalg.norm(forward)
-    check("up, camera", length > 1e-6, "directions that are not parallel, got parallel ones")
+    check(
+        "up, camera",
+        length > 1e-6,
+        "a camera that does not look along `up`, got parallel directions",
+    )
     forward = forward / length
     return np.stack([np.cross(forward, axis), -axis, forward])
 
@@ -113,8 +118,8 @@ def _add(
     focal: float,
     place: tuple[int, int, int],
 ) -> None:
-    """Add what a side shows to some rows of a panorama; `place` is the first of them,
-    and the panorama's height and width."""
+    """Add the picture of a side to some rows of a panorama. `place` is the index of the
+    first row, and the panorama's height and width."""
     first, height, width = place
     longitudes = ((np.arange(width) + 0.5) / width - 0.5) * 2 * math.pi
     rows = first + np.arange(len(planes))
@@ -135,8 +140,8 @@ def _add(
 
 
 def _interpolated(pixels: Floats, column: Floats, row: Floats) -> Floats:
-    """Return (N, C) the bilinear interpolation of a picture (H, W, C) at places in
-    px."""
+    """Return (N, C) values of a picture (H, W, C) at positions in px, by bilinear
+    interpolation."""
     last = pixels.shape[0] - 2
     left = np.clip(np.floor(column), 0, last).astype(np.int64)
     top = np.clip(np.floor(row), 0, last).astype(np.int64)

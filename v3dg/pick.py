@@ -1,4 +1,4 @@
-"""Picking: the object that a pixel shows."""
+"""Picking: finds the gaussian that a pixel shows."""
 
 import copy
 from dataclasses import dataclass
@@ -20,14 +20,15 @@ from v3dg.select import rule_of, select
 
 @dataclass(frozen=True)
 class Pick:
-    """The gaussian with the largest weight in a pixel, and what it belongs to.
+    """The gaussian with the largest weight in a pixel, and the cluster and instance
+    that contain it.
 
     Attributes:
-        instance: The gaussian's instance.
-        cluster: Its cluster, as an index in the instance's bundle.
+        instance: Index of the instance.
+        cluster: Index of the cluster in the instance's bundle.
         level: The cluster's level.
-        weight: Its blend weight in the pixel, 0 to 1.
-        depth: Its depth along the camera's axis, world units.
+        weight: Blend weight of the gaussian in the pixel, 0 to 1.
+        depth: Depth of the gaussian along the camera's axis, in world units.
         position: (3,) float64, the point at that depth on the pixel's ray, in the
             world.
     """
@@ -55,27 +56,28 @@ def pick(
     `v3dg.render` draws; None if the pixel is empty. Its position is NaN where the lens
     shows no direction, and a gaussian beside it reaches the pixel.
 
-    Computes only this pixel, on the CPU; the cut is the same on every device.
+    Only this pixel is computed, on the CPU. The cut is the same on every device.
 
     Args:
         subject: The subject of the picture, or its file.
         x: Column, from 0 at the left.
         y: Row, from 0 at the top.
-        tolerance: As for the picture; so are `budget` and `min_level`.
-        renderer: A renderer of the same scene with a pool on the CPU: use only what is
-            resident there, and read nothing.
+        tolerance, budget, min_level: The same values as for the picture.
+        renderer: A renderer of the same scene with a pool on the CPU. Then only
+            gaussians in its pool are considered, and no pages are read.
 
     Raises:
         ValueError: The pixel is not in the image, or another argument is invalid for
             `v3dg.render`.
     """
     check_type("camera", camera, Camera, "a Camera")
-    x = whole(x, "x", "a column", 0)
-    y = whole(y, "y", "a row", 0)
+    x = whole(x, "x", "a column index of at least 0", 0)
+    y = whole(y, "y", "a row index of at least 0", 0)
     is_inside = x < camera.width and y < camera.height
-    check("x, y", is_inside, f"a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
-    scene = copy.copy(Scene.of(opened(subject)))  # another thread may change the scene meanwhile
-    if budget is not None:  # the budget applies to the whole picture
+    check("x, y", is_inside, f"a pixel inside {camera.width} x {camera.height}, got ({x}, {y})")
+    # Other threads may change the scene meanwhile.
+    scene = copy.copy(Scene.of(opened(subject)))
+    if budget is not None:  # the budget is for the whole picture, not for one pixel
         cut = select(
             scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU
         )
@@ -109,11 +111,13 @@ def _pick_from_pool(
     """Pick from the gaussians that are resident in the renderer's pool.
 
     Raises:
-        TypeError: This is not a renderer.
+        TypeError: ``renderer`` is not a Renderer.
         ValueError: The renderer draws another scene, or has no pool on the CPU.
     """
     check_type("renderer", renderer, Renderer, "a Renderer")
-    expected = "one of this subject, got one of another; make a renderer of what is picked from"
+    expected = (
+        "a renderer of this subject, got one of another subject; create a renderer for this one"
+    )
     check("renderer", _draws(renderer, scene), expected)
     pool = renderer.pool_frame
     if pool is None or pool.device.is_cuda:
@@ -122,8 +126,8 @@ def _pick_from_pool(
 
 
 def _draws(renderer: Renderer, scene: Scene) -> bool:
-    """Return whether a renderer draws the instances of this scene, from the same
-    bundles or the same files."""
+    """Return whether a renderer draws the same instances as this scene, from the same
+    bundles or from the same files."""
     if isinstance(renderer.subject, Gaussians):
         return False
     drawn = Scene.of(renderer.subject)

@@ -1,5 +1,4 @@
-"""8-bit pictures: made from colours, arranged on contact sheets, and written to files
-that appear when they are complete."""
+"""8-bit pictures: conversion from colours, contact sheets, reading, and writing."""
 
 import io
 import os
@@ -16,16 +15,17 @@ from v3dg._numbers import check
 from v3dg.gaussians import Array
 
 Picture: TypeAlias = NDArray[np.uint8]
-"""(H, W, 3)"""
+"""(H, W, 3) uint8, sRGB."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MOST_SIDE = 65_500
 """Largest side of a picture in px, which is JPEG's limit."""
 MOST_PIXELS_DRAWN = 1 << 27
-"""Largest picture that is drawn; each pixel needs 20 bytes of memory."""
-MOST_PIXELS_COMPARED = 1 << 25
-"""Largest picture that is compared, an 8K screen; each pixel needs 200 bytes of
+"""Maximum number of pixels of a picture that is drawn; each needs 20 bytes of
 memory."""
+MOST_PIXELS_COMPARED = 1 << 25
+"""Maximum number of pixels of a picture that is compared: an 8K screen. Each needs 200
+bytes of memory."""
 
 _GAP_PX = 6
 _TEXT_PX = 18
@@ -34,8 +34,8 @@ _INK = (238, 240, 243)
 
 
 def to_8bit(image: Array) -> Picture:
-    """Convert display values in [0,1] to 0..255 by rounding, on the device of the
-    array; values outside are clipped."""
+    """Convert display values from [0,1] to 0..255 with rounding, on the device of the
+    array. Other values are clipped."""
     if hasattr(image, "detach"):
         import torch
 
@@ -45,7 +45,7 @@ def to_8bit(image: Array) -> Picture:
 
 
 def checked(name: str, image: Array) -> NDArray[np.generic]:
-    """Return a picture as a NumPy array (H,W,3), on the host, without gradient; raise
+    """Return a picture (H,W,3) as a NumPy array on the host, without gradients; raise
     TypeError or ValueError if it is not a picture."""
     if hasattr(image, "detach"):
         image = image.detach().cpu().numpy()
@@ -59,7 +59,8 @@ def checked(name: str, image: Array) -> NDArray[np.generic]:
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
-    """Arrange rows of (text, picture) as one picture, each text above its picture."""
+    """Arrange rows of pairs (text, picture) as one picture, with each text above its
+    picture."""
     from PIL import Image, ImageDraw, ImageFont
 
     heights = [max(picture.shape[0] for _, picture in row) for row in rows]
@@ -80,33 +81,34 @@ def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
-    """Check, before long work, that the name of a picture has a known suffix.
+    """Check that the name of a picture has a known suffix; used before long work.
 
     Raises:
         ValueError: The suffix is not one of ``SUFFIXES``.
     """
     path = Path(path)
     is_known = path.suffix.lower() in SUFFIXES
-    check(path, is_known, f"a file name ending in {', '.join(SUFFIXES)}; choose one of them")
+    check(path, is_known, f"a file name ending in {', '.join(SUFFIXES)}")
     return path
 
 
 def check_size(name: str, width: int, height: int, most_pixels: int = MOST_PIXELS_DRAWN) -> None:
-    """Raise ValueError for a picture that is too large, before anything is decoded or
-    drawn.
+    """Check the size of a picture before it is decoded or drawn.
 
     Raises:
         ValueError: A side has more than ``MOST_SIDE`` px, or the picture more than
             ``most_pixels``.
     """
-    expected = f"a picture of at most {MOST_SIDE:,} px a side and {most_pixels:,} px in all"
+    expected = (
+        f"a picture of at most {MOST_SIDE:,} px a side and at most {most_pixels:,} px in total"
+    )
     fits = max(width, height) <= MOST_SIDE and width * height <= most_pixels
-    check(name, fits, f"{expected}, got {width} x {height}")
+    check(name, fits, f"{expected}, got {width} x {height} px")
 
 
 def read_picture(path: str | os.PathLike[str]) -> Picture:
-    """Read a PNG or a JPEG for a comparison, whatever the name's suffix is;
-    transparency is ignored.
+    """Read a PNG or a JPEG for a comparison. Its suffix and its transparency are
+    ignored.
 
     Raises:
         ValueError: The file is not a PNG or a JPEG, is damaged or too large, or has
@@ -117,15 +119,21 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
 
     name = os.fspath(path)
     with warnings.catch_warnings(), open(_files.open_regular(path), "rb") as file:
-        # The warnings concern other content of the file, such as further pictures.
+        # Pillow's warnings are about other content of the file, such as further
+        # pictures.
         warnings.simplefilter("ignore")
         is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
         check(name, is_known, "a PNG or a JPEG, got another file")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
-            # Pillow starts external programs for other formats.
+            # Only these formats are allowed, because Pillow starts external programs
+            # for some others.
             image = Image.open(file, formats=("PNG", "JPEG"))
         check_size(name, *image.size, MOST_PIXELS_COMPARED)
-        check(name, not image.mode.startswith("I"), "8 bits a channel, got 16; convert it first")
+        check(
+            name,
+            not image.mode.startswith("I"),
+            "8 bits per channel, got 16; convert the picture first",
+        )
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
             return np.asarray(image.convert("RGB"))
 
@@ -142,15 +150,14 @@ def encode_png(image: Array) -> bytes:
 def write_picture(
     path: str | os.PathLike[str], image: Array, *, alpha: Array | None = None
 ) -> None:
-    """Write a picture as PNG or JPEG; the file appears when it is complete.
+    """Write a picture as PNG or JPEG. The file appears only when it is complete.
 
     Args:
-        path: Its folder is created if needed.
+        path: Path of the file. Its folder is created if needed.
         image: (H, W, 3) floats in [0, 1], or 8-bit values.
         alpha: (H, W) coverage in [0, 1], for a transparent PNG; `image` is then the
             premultiplied colours of a picture that was drawn on black, as floats. The
-            file
-            has straight alpha: colours divided by alpha, as PNG demands.
+            file has straight alpha: colours divided by alpha, as PNG demands.
 
     Raises:
         TypeError, ValueError: A shape, a type or a value is not as above, or the suffix
@@ -167,13 +174,14 @@ def write_picture(
         pixels = _straight(pixels, alpha)
     if pixels.dtype != np.uint8:
         check("image", pixels.dtype.kind == "f", f"uint8, or floats in [0,1], got {pixels.dtype}")
-        check("image", not np.isnan(pixels).any(), "colours, got NaN")
+        check("image", not np.isnan(pixels).any(), "colours without NaN, got NaN")
         pixels = to_8bit(pixels)
     kind = "JPEG"
     if path.suffix.lower() == ".png":
         kind = "PNG"
     with _files.replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary, kind, quality=90)  # for JPEG
+        # `quality` is used only for JPEG.
+        Image.fromarray(pixels).save(temporary, kind, quality=90)
 
 
 def _straight(premultiplied: NDArray[np.generic], alpha: Array) -> NDArray[np.generic]:

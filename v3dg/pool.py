@@ -1,4 +1,4 @@
-"""Pools: the part of a scene's bundles that is resident, in memory of a fixed size."""
+"""Pools: memory of a fixed size for the resident pages of a scene's bundles."""
 
 import threading
 import time
@@ -10,14 +10,14 @@ from v3dg.bundle import Bundle
 from v3dg.levels.memory import free_bytes
 from v3dg.residency import ResidentScene, residency
 
-# Upper limit of the memory left free for frames, tables and everything else.
+# Maximum amount of memory that stays free for frames, tables and other data.
 _RESERVE_BYTES = 1 << 30
-NUM_THREADS = 8  # threads that read pages; a disk serves several requests at once
-_WAIT_SECONDS = 0.05  # upper limit of the delay until Ctrl-C is handled
+NUM_THREADS = 8  # threads that read pages; disks process several requests at once
+_WAIT_SECONDS = 0.05  # maximum delay before Ctrl-C is handled
 
 
 def free_on(device: Device) -> int:
-    """Return the bytes of memory that a device has available."""
+    """Return the free memory of a device in bytes."""
     if not device.is_cuda:
         return free_bytes()
     import torch
@@ -27,8 +27,8 @@ def free_on(device: Device) -> int:
 
 
 def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
-    """Return half of the free bytes of the device, for a pool, if not everything fits
-    there; None if it does."""
+    """Return the size in bytes for a pool on a device, half of its free memory; None if
+    all gaussians fit without a pool."""
     for memory, num_bytes in residency.bytes_to_add(bundles, device).items():
         free = free_on(memory)
         if num_bytes > free - min(free // 4, _RESERVE_BYTES):
@@ -37,14 +37,14 @@ def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
 
 
 class Pool:
-    """Pages of bundles in memory of a fixed size on one device, which come and go as
-    views need them.
+    """Memory of a fixed size on one device, into which pages of bundles are loaded, and
+    from which they are evicted, as views need them.
 
     Attributes:
-        tables: The tables of its bundles.
-        num_bytes: The size of its memory.
-        lease: Held by a thread from `settle` until its picture is drawn, so that no
-            view of another thread replaces the pages in between.
+        tables: The tables of the bundles.
+        num_bytes: The size of the pool in bytes.
+        lease: A lock that a thread holds from `settle` until its picture is drawn, so
+            that views of other threads do not evict the pages meanwhile.
     """
 
     def __init__(
@@ -68,13 +68,13 @@ class Pool:
         timeout: float,
         seconds: float,
     ) -> None:
-        """Bring in the pages that a view needs, or those that arrive within
+        """Bring in the pages that a view needs, or as many of them as arrive within
         ``seconds``.
 
         Raises:
             ValueError: A page is damaged.
-            OSError: A page cannot be read. TimeoutError if no page arrived for
-                `timeout` seconds.
+            OSError: A page cannot be read. TimeoutError: No page arrived for `timeout`
+                seconds.
         """
         core = self.core
         start = time.monotonic()
@@ -102,21 +102,21 @@ class Pool:
             elif time_of_step - last_arrival > timeout:
                 raise TimeoutError(
                     f"settle: {step.num_absent} pages are missing and none arrived for {timeout:g} "
-                    "s; does the disk or the server respond?"
+                    "s; check that the disk or the server responds"
                 )
             core.wait(_WAIT_SECONDS)
 
 
 class PoolSlot:
-    """The pool that single pictures of one subject share on one device: the one that
-    was requested last."""
+    """The pool that single pictures of one subject share on one device. Only the pool
+    that was requested last is kept."""
 
     def __init__(self) -> None:
         self._pool: Pool | None = None
 
     @property
     def num_bytes(self) -> int | None:
-        """The size of the pool; None if there is none."""
+        """The size of the pool in bytes; None if there is no pool."""
         if self._pool is None:
             return None
         return self._pool.num_bytes
@@ -128,8 +128,8 @@ class PoolSlot:
         device: Device,
         num_bytes: int,
     ) -> Pool:
-        """Return a pool of these bundles and of this size. A different one is freed
-        first, because its memory is needed.
+        """Return a pool of this size for these bundles. If the present pool is
+        different, it is freed first, because its memory may be needed.
 
         Requires the lock of `residency`.
         """

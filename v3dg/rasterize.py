@@ -1,5 +1,5 @@
-"""Draw gaussians without levels: project, bin, blend; differentiable for torch
-tensors."""
+"""Draws gaussians without levels of detail: projects, bins and blends them.
+Differentiable for torch tensors."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ def rasterize(
     antialiased: bool | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Image:
-    """Draw gaussians with the semantics of 3D Gaussian Splatting, as gsplat 1.5 defines
-    them.
+    """Draw gaussians as defined by 3D Gaussian Splatting and implemented by gsplat 1.5.
 
-    Alpha is clamped to 0.999, contributions below 1/255 are skipped, a pixel stops
-    before its transmittance would fall to 1e-4, and gaussians are blended by ascending
-    depth, ties by index.
+    Alpha is clamped to 0.999, and contributions below 1/255 are skipped. Gaussians are
+    blended by ascending depth, and by index where depths are equal. A pixel stops
+    before its transmittance would fall to 1e-4.
 
     With torch tensors the picture is differentiable with respect to the gaussians'
     means, quats, scales, opacities and sh, and to `background` if that is a tensor;
@@ -45,15 +44,15 @@ def rasterize(
     run.
 
     Args:
-        gaussians: N gaussians in world space; or the file of an asset.
-        camera: Its model may be any.
-        filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 is the
-            value that the original 3DGS code trains with.
-        antialiased: Multiply opacities by sqrt(det before / det after the filter)
-            (Mip-Splatting, eq. 9), so that the filter widens a gaussian without
-            increasing its total opacity. None means what the gaussians say
-            (`Gaussians.antialiased`).
-        background: Three numbers, or a tensor of them.
+        gaussians: N gaussians in world space, or the path of an asset's file.
+        camera: Camera of any model.
+        filter_px2: Variance of the low-pass filter in screen space, px². The original
+            code of 3DGS trains with 0.3.
+        antialiased: Whether to multiply opacities by the square root of det(covariance)
+            before / after the filter (Mip-Splatting, eq. 9), so that the filter widens
+            a gaussian without increasing its total opacity. None uses
+            `Gaussians.antialiased`.
+        background: Three numbers, or a tensor of three.
 
     Raises:
         ValueError: The filter is negative, the background is not three numbers, or the
@@ -62,7 +61,8 @@ def rasterize(
             CUDA.
     """
     gaussians = loaded(gaussians)
-    if not hasattr(gaussians, "means"):  # any object with the arrays of Gaussians is accepted
+    # Any object with the same arrays as Gaussians is accepted.
+    if not hasattr(gaussians, "means"):
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
     check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
@@ -91,18 +91,18 @@ def rasterize(
 
 
 def check_device(means: Array) -> None:
-    """Raise unless tensors of this dtype can be drawn on their device."""
+    """Raise an error unless tensors of this dtype can be drawn on their device."""
     if means.is_cuda and not _core.has_cuda:
         raise RuntimeError(
             f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')"
         )
     if means.is_cuda and str(means.dtype) == "torch.float64":
         advice = "call gaussians.torch('cpu'), or use float32"
-        raise ValueError(f"gaussians: float64 is computed on the CPU only; {advice}")
+        raise ValueError(f"gaussians: float64 is supported only on the CPU; {advice}")
 
 
 def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return stacked tensors; a single one is not copied."""
+    """Return stacked tensors; a single tensor is not copied."""
     import torch
 
     if len(parts) == 1:
@@ -112,36 +112,36 @@ def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class DrawSettings:
-    """The settings of `_core.rasterize`, by its names."""
+    """Arguments of `_core.rasterize`."""
 
     filter_px2: float
     antialiased: bool
     with_depth: bool = True
-    plain_colors: bool = False  # sh has colours instead of coefficients
+    plain_colors: bool = False  # whether sh contains colours instead of coefficients
 
 
 @dataclass(eq=False)
 class CenterGradient:
-    """The gradient with respect to centres on the images, which the backward pass
-    sets."""
+    """The gradient with respect to the centres on the images. The backward pass sets
+    it."""
 
     value: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class CenterProbe:
-    """Receives the gradient of pictures with respect to the centres of gaussians on the
-    images.
+    """Receives the gradient of pictures with respect to the image positions of
+    gaussians' centres.
 
     Attributes:
-        centers: The centres, (V, N, 2)[pairs]. They have no effect on the picture, but
-            autograd provides their gradient.
+        centers: Centres (V, N, 2)[pairs] for V views and N gaussians. Their values are
+            not used; they exist so that autograd provides their gradient.
         pairs: The index that selects the rows in `centers`.
         with_sizes: Whether `centers.absgrad` becomes the sum over pixels of absolute
             gradients.
         gradient: Receives the gradient with respect to `centers`. It is a separate
-            object because the operation that made the centres keeps it: keeping the
-            centres would be a reference cycle.
+            object, because the operation that made the centres keeps a reference to it;
+            a reference to the centres themselves would be a cycle.
     """
 
     centers: torch.Tensor
@@ -156,13 +156,13 @@ def draw_views(
     inputs: Sequence[Sequence[torch.Tensor]],
     probe: CenterProbe | None = None,
 ) -> tuple[torch.Tensor, ...]:
-    """Draw tensors, differentiably. Returns colour, alpha and depth (or None) of the
-    first view, of the next...
+    """Draw tensors differentiably. Return colour, alpha and depth (or None) of the
+    first view, then those of the next view, and so on.
 
     Args:
         cameras: V cameras.
-        inputs: Means, quats, scales, opacities, sh, backgrounds: one tensor each, or
-            several that the views use in turn.
+        inputs: For each of means, quats, scales, opacities, sh and backgrounds: one
+            tensor, or several that are assigned to the views cyclically.
         probe: Receives the gradient with respect to the centres on the images.
     """
     import torch
@@ -177,8 +177,8 @@ def draw_views(
 
 
 def _slots_of_view(counts: list[int], view: int) -> list[int]:
-    """Return, for each kind of input, the index among all tensors of the one that a
-    view uses."""
+    """Return, for each kind of input, the index (among all tensors) of the tensor that
+    a view uses."""
     return [sum(counts[:kind]) + view % count for kind, count in enumerate(counts)]
 
 
@@ -227,8 +227,8 @@ def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) 
 
 
 def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch.Tensor:
-    """Store and return the gradient by the centres, from that of each view, with its
-    sizes if requested."""
+    """Store and return the gradient with respect to the centres, given that of each
+    view. Also store the sums of absolute gradients, if requested."""
     d_centers, *sizes = (joined(parts)[probe.pairs] for parts in zip(*gradients, strict=True))
     probe.gradient.value = d_centers
     if probe.with_sizes:
@@ -250,8 +250,8 @@ def _input_parts(gradients: _core.Gradients) -> list[Array]:
 
 
 def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
-    """Return the gradients with respect to the centres and their sizes, if
-    requested."""
+    """Return the gradients with respect to the centres and, if requested, the sums of
+    absolute gradients."""
     import torch
 
     parts = (gradients.centers, gradients.center_sizes)
@@ -259,7 +259,7 @@ def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
 
 
 class _Context(Protocol):
-    """The data that autograd keeps from the forward to the backward pass."""
+    """The data that autograd stores between the forward and the backward pass."""
 
     counts: list[int]
     probe: CenterProbe | None
@@ -288,8 +288,8 @@ def _forward(
         if tape is not None:
             ctx.tapes.append(tape)
         pictures += planes
-    # On a GPU the backward pass reads the inputs again, so autograd must detect later
-    # writes to them.
+    # On a GPU, the backward pass reads the inputs again, so autograd must detect if
+    # they were overwritten.
     if inputs[0].is_cuda:
         ctx.save_for_backward(*inputs[: -ctx.counts[-1]], *pictures)
     return tuple(pictures)
@@ -298,10 +298,10 @@ def _forward(
 def _backward(
     ctx: _Context, gradients: Sequence[torch.Tensor | None]
 ) -> tuple[torch.Tensor | None, ...]:
-    """Return the gradients with respect to the centres, then those to all inputs."""
+    """Return the gradients with respect to the centres and then to all inputs."""
     import torch
 
-    _ = ctx.saved_tensors  # raises if a saved tensor was overwritten
+    _ = ctx.saved_tensors  # raises an error if a saved tensor was overwritten
     wants_centers, *wants_input = ctx.needs_input_grad[5:]
     probe = ctx.probe
     with_sizes = probe is not None and probe.with_sizes
@@ -323,7 +323,7 @@ def _backward(
 
 @functools.cache
 def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
-    """Return the operation and its gradient, for torch tensors on any device."""
+    """Return the differentiable operation for torch tensors on any device."""
     import torch
 
     class Rasterize(torch.autograd.Function):
@@ -337,7 +337,7 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
             probe: CenterProbe | None,
             *tensors: torch.Tensor,
         ) -> tuple[torch.Tensor | None, ...]:
-            # The first tensor, the centres, only takes part in the backward pass.
+            # The first tensor, the centres, is only used in the backward pass.
             inputs = tensors[1:]
             ctx.set_materialize_grads(False)
             ctx.counts = counts

@@ -1,5 +1,5 @@
-"""Refines all levels of a bundle together, in pictures of cuts, where gaussians hide
-each other."""
+"""Refines all levels of a bundle together, by comparing pictures of cuts with pictures
+of the asset."""
 
 import os
 from collections.abc import Iterable, Mapping
@@ -14,7 +14,8 @@ from v3dg.levels.refined import DROP, refined_bundle
 from v3dg.opening import File
 
 _UNDISTORT = (
-    "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
+    "undistort the pictures first, or ignore the distortion: distortion='ignore' in Python, "
+    "--distortion ignore in a command"
 )
 
 
@@ -28,38 +29,38 @@ def refine_bundle(
     device: str | Device = "auto",
     progress: Progress = True,
 ) -> Bundle:
-    """Return a copy of a bundle whose levels look more like its asset, in small and
-    large pictures.
+    """Return a copy of a bundle whose levels look more like its asset.
 
     A build fits every group alone, seen from all sides, at the size at which it is
-    selected. Pictures of cuts show gaussians next to each other, where they hide each
-    other. With such pictures, this function drops the least visible gaussians of all
-    levels but the first, and moves the others until the pictures match those of the
-    asset. Cuts have between 0.7 of the asset's gaussians and the number of the last
-    level. Pictures have 0.18 to 9.7 times the native size of the cut, which is 2 px² a
-    gaussian. docs/levels.md has the gain.
+    selected. In pictures of whole cuts, gaussians of different groups hide each other.
+    With such pictures, this function drops the least visible gaussians of each level
+    above level 0 and optimises the others, until the pictures match those of the asset.
+    The number of gaussians in a cut is between that of the last level and 0.7 times
+    that of the asset. Pictures have 0.18 to 9.7 times the native size of the cut, which
+    is 2 px² per gaussian. docs/levels.md describes the gain.
 
     The same bundle, cameras, steps, share and seed give the same bits on the same kind
     of device.
 
     Args:
-        bundle: A bundle of `build_bundle`, or its file. The function takes about six
-            times the bundle's memory.
-        cameras: Views of the asset, also by name: for a room, those of its photographs.
-            Views from elsewhere may get worse. Without cameras, pictures are taken from
-            all around.
-        steps: Number of pictures that are compared. A GPU takes sixteen for each step
-            of its gradients, and rounds up.
-        drop: Share of a level's visibility, 0 to 0.5, up to which its least visible
-            gaussians are dropped; 0 keeps all. Refining a bundle again drops gaussians
-            again.
+        bundle: A bundle of `build_bundle`, or the path of its file. The function needs
+            about six times the memory of the bundle.
+        cameras: Cameras of the pictures, in a sequence or by name. For a room, use
+            those of its photographs; views from other places may get worse. Without
+            cameras, pictures show the asset from all directions.
+        steps: Number of pictures that are compared. A GPU uses sixteen of them for each
+            optimisation step, so the number is rounded up.
+        drop: Share of a level's visibility, 0 to 0.5, that may be lost by dropping its
+            least visible gaussians; 0 keeps all. Every further refinement of a bundle
+            drops gaussians again.
         seed: Seed of the pictures.
         device: The device that computes.
         progress: See `build_bundle`.
 
     Raises:
-        TypeError: ``bundle`` is not a bundle, or a camera is not a camera.
-        ValueError: There are no steps, or the share or the seed is out of range.
+        TypeError: ``bundle`` is not a Bundle, or an element of ``cameras`` is not a
+            Camera.
+        ValueError: ``steps``, ``drop`` or ``seed`` is out of range.
         RuntimeError: The device is "cuda" and cannot be used.
         KeyboardInterrupt: Ctrl-C was pressed; threads have stopped.
     """
@@ -72,9 +73,9 @@ def refine_bundle(
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
         check_pinhole(f"cameras[{number}]", camera, _UNDISTORT)
-    steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
-    drop = real(drop, "drop", "a share of 0 to 0.5", 0, 0.5)
-    seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
+    steps = whole(steps, "steps", "at least 1 step", 1, 1_000_000)
+    drop = real(drop, "drop", "a share from 0 to 0.5", 0, 0.5)
+    seed = whole(seed, "seed", "a whole number from 0 to 2^58 - 1", 0, (1 << 58) - 1)
     chosen_device = _device.resolve(device)
     return refined_bundle(
         bundle,

@@ -1,9 +1,9 @@
 """Residency: the data of bundles and scenes on devices. It is the only cache of the
 package.
 
-Data is freed with its bundle or scene, or by `residency.clear()`. The buffers and slots
-of a `Renderer` belong to it and are freed with it. docs/architecture.md, "Memory on the
-GPU", lists every owner.
+Data is freed with its bundle or scene, or by `residency.clear()`. The buffers and pool
+slots of a `Renderer` are freed with the renderer. docs/architecture.md, "Memory on the
+GPU", lists the owners of all memory.
 """
 
 import atexit
@@ -29,24 +29,27 @@ from v3dg.scene import Scene, Subject
 
 _T = TypeVar("_T")
 
-# A GPU decodes quantised bundles of up to this size once, rather than in each frame and
-# for each instance. The limit is about the size of its second-level cache. Above it,
-# drawing codes is as fast and takes a seventh of the memory.
+# Quantised bundles up to this size are decoded once on a GPU, rather than in each frame
+# and for each instance. The limit is about the size of the GPU's second-level cache.
+# For larger bundles, drawing the codes is as fast and needs a seventh of the memory.
 MOST_DECODED_BYTES = 48 << 20
-_PACKED_BYTES = 64  # per gaussian, in addition to its row, for the frames of a GPU
-_TOO_MANY_BYTES = 1 << 62  # more than any memory has, so that pages are read one by one
+# Bytes per gaussian that frames on a GPU need in addition to its row.
+_PACKED_BYTES = 64
+# More than any memory, so that pages are read as pictures need them.
+_TOO_MANY_BYTES = 1 << 62
 
-# Kinds of entries that a child of a fork makes anew, because threads that exist only in
-# the parent may have been using them.
+# Kinds of entries that a child after fork() must create again, because threads that
+# exist only in the parent may have been using them.
 _NOT_INHERITED = ("frame", "pool", "scene")
 
 _NO_VALUE = object()
-# Any number of threads may enter it; made once, because every frame needs it.
+# Any number of threads may enter this context at once. It is created only once, because
+# every frame needs it.
 _NO_TURN = nullcontext()
 
 
 class _LastResult:
-    """The result for the value that was last requested."""
+    """The result for the most recently requested value."""
 
     def __init__(self) -> None:
         self.value: Hashable = _NO_VALUE
@@ -54,21 +57,21 @@ class _LastResult:
 
 
 class ResidentScene:
-    """The data of a scene that selection and frames read on one device. On the CPU it
-    never changes.
+    """The data of a scene that selection and frames read on one device. On the CPU this
+    data never changes.
 
     Attributes:
         core: The corresponding object of the compiled module.
-        references: Weak references to the bundles; a different tuple after the bundles
-            have changed.
-        revision: The revision of the scene that this data belongs to.
+        references: Weak references to the bundles. When bundles are added, this becomes
+            a new tuple.
+        revision: The revision of the scene that this data was made from.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self.core = _core.ResidentScene(device.number)
-        # The references are weak, because a bundle that is drawn by itself would
-        # otherwise keep itself alive.
+        # The references are weak. Otherwise a bundle that is drawn without a scene
+        # would keep itself alive.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
         # Drawings that may be in progress.
         self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()
@@ -81,18 +84,18 @@ class ResidentScene:
         return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
     def is_of(self, subject: Subject) -> bool:
-        """Return whether this is the data of the subject's current revision; a bundle
+        """Return whether this data is from the subject's current revision. A bundle
         never changes."""
         if isinstance(subject, Scene):
             return self.revision == subject.revision
         return self.revision[0] >= 0
 
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
-        """Update what has changed since the last call: only the poses, or all
-        instances.
+        """Update the data after a change of the scene: only the poses if nothing else
+        changed, otherwise all instances.
 
-        Frames in progress are finished first, because a frame that found a buffer too
-        small will be drawn again.
+        Frames in progress are finished first, because a frame whose buffers were too
+        small is drawn again from this data.
 
         Raises:
             RuntimeError: A CUDA graph is being captured.
@@ -101,8 +104,10 @@ class ResidentScene:
             import torch
 
             if torch.cuda.is_current_stream_capturing():
-                expected = "no change while a CUDA graph is captured, got a new or changed scene"
-                raise RuntimeError(f"scene: expected {expected}; draw it once before the capture")
+                expected = "no change while a CUDA graph is captured, got a new or a changed scene"
+                raise RuntimeError(
+                    f"scene: expected {expected}; draw the scene once before the capture"
+                )
         with self._lock:
             under_way = list(self._drawings)
             self._drawings.clear()
@@ -130,25 +135,26 @@ class ResidentScene:
         self.revision = scene.revision
 
     def add_drawing(self, drawing: _core.Drawing) -> None:
-        """Remember a frame that may be in progress."""
+        """Keep track of a frame that may be in progress."""
         if self.device.is_cuda:
             with self._lock:
                 self._drawings.add(drawing)
 
     def _on_device(self, rows: Array) -> Array:
-        """Return the rows on this device if they are on another CUDA device, else
-        unchanged."""
+        """Return the rows on this device if they are on another CUDA device; otherwise
+        return them unchanged."""
         if getattr(rows, "is_cuda", False) and rows.device.index != self.device.number:
             return rows.to(str(self.device))
         return rows
 
 
 class Residency:
-    """The data of bundles and scenes on devices, kept as long as the bundle or scene
-    exists.
+    """A cache for the data of bundles and scenes on devices. Data is kept as long as
+    its bundle or scene exists.
 
-    Data is made when it is first requested; several devices may hold the same bundle at
-    once. Adding a bundle to a scene does not move the gaussians of the others.
+    Data is created when it is first requested. A bundle may be on several devices at
+    once. When a bundle is added to a scene, the gaussians of the other bundles are not
+    copied again.
     """
 
     def __init__(self) -> None:
@@ -158,8 +164,8 @@ class Residency:
         os.register_at_fork(after_in_child=self._after_fork)
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
-        """Return the tables of the bundle's clusters that selection and drawing read,
-        on the host."""
+        """Return the tables of a bundle's clusters, on the host, for selection and
+        drawing."""
         clusters = bundle.clusters
         groups = bundle.groups
 
@@ -179,8 +185,8 @@ class Residency:
         return self.once(bundle, "table", make)
 
     def turn(self, device: Device) -> AbstractContextManager[object]:
-        """Keep scenes on the device unchanged inside the context; on CUDA, other
-        threads wait."""
+        """Return a context in which scenes on the device do not change. On CUDA, only
+        one thread at a time can be inside it."""
         if device.is_cuda:
             return self.lock
         return _NO_TURN
@@ -188,24 +194,25 @@ class Residency:
     def scene(
         self, subject: Subject, device: Device, last: ResidentScene | None = None
     ) -> ResidentScene:
-        """Return the data of the current scene on a device; a bundle counts as a scene
-        of one instance.
+        """Return the data of a scene's current revision on a device. A bundle counts as
+        a scene with one instance.
 
-        Mostly the result is the same as the last time; passing that as ``last`` saves
-        the search.
+        The result is often the same as in the last call. Passing that as ``last`` makes
+        the call faster.
         """
         if last is not None and last.is_of(subject):
             return last
         if isinstance(subject, Gaussians):
             raise TypeError(
-                "subject: expected a Scene or a Bundle, got Gaussians; build a bundle of them"
+                "subject: expected a Scene or a Bundle, got Gaussians; build a bundle from them"
             )
         with self.lock:
             resident = self.once(subject, ("scene", device), lambda: ResidentScene(device))
             if resident.is_of(subject):
                 return resident
             scene = copy.copy(Scene.of(subject))
-            if resident.revision[0] >= 0 and not device.is_cuda:  # on the CPU it never changes
+            # On the CPU, existing data never changes.
+            if resident.revision[0] >= 0 and not device.is_cuda:
                 resident = ResidentScene(device)
             resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
             self._entries[subject]["scene", device] = resident
@@ -214,8 +221,8 @@ class Residency:
     def rows(
         self, bundle: Bundle, clusters: NDArray[np.int32], device: Device
     ) -> tuple[_core.Rows, NDArray[np.int64]]:
-        """Return the gaussians of the bundle on a device, and the first row of each of
-        S clusters, (S,)."""
+        """Return the gaussians of a bundle on a device, and the index (S,) of the first
+        row of each of S clusters."""
         if not self._draws_codes(bundle, device):
             return self.gaussians(bundle, device).rows, bundle.clusters.offset[clusters]
         ids, place = np.unique(clusters, return_inverse=True)
@@ -223,8 +230,8 @@ class Residency:
         return Gaussians(*self.model(bundle, device).decode(ids)).rows, first[place]
 
     def model(self, bundle: Bundle, device: Device) -> _core.Model:
-        """Return the bundle's gaussians, or their codes, in the layout of a device's
-        frames."""
+        """Return a bundle's gaussians, or their codes, in the layout of the frames of a
+        device."""
 
         def make() -> _core.Model:
             codes = bundle.codes
@@ -243,8 +250,8 @@ class Residency:
     def set_models(
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
     ) -> None:
-        """Make a frame draw these bundles, with the colours of gaussians or of
-        clusters."""
+        """Set the bundles that a frame draws, with the gaussians' own colours or with a
+        palette."""
         palettes = [
             _core.Palette(self.table(bundle), sh, device.number)
             for bundle in bundles
@@ -253,15 +260,15 @@ class Residency:
         frame.set_models([self.model(bundle, device) for bundle in bundles], palettes)
 
     def palette(self, bundle: Bundle, color_by: ColorBy) -> NDArray[np.float32] | None:
-        """Return the cached result of `palette_of`."""
+        """Return the palette of a bundle; see `palette_of`."""
         return self.once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
 
     def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
-        """Return the bytes, for device and host, of the gaussians that are not on the
-        device yet.
+        """Return the number of bytes that are still needed on the device and on the
+        host to make all gaussians of these bundles resident on the device.
 
-        Bundles at URLs count as more than any memory has, so that their pages are
-        fetched as pictures need them.
+        A bundle at a URL counts as larger than any memory, so that its pages are
+        downloaded only as pictures need them.
         """
         add = {device: 0, CPU: 0}
         for bundle in bundles:
@@ -272,15 +279,16 @@ class Residency:
                 add[CPU] += _TOO_MANY_BYTES
             elif not bundle.is_in_memory:
                 add[CPU] += bundle.page_bytes
-            if device.is_cuda or not is_coded:  # the CPU draws codes without copying them
+            # The CPU draws codes without copying them.
+            if device.is_cuda or not is_coded:
                 add[device] += bundle.page_bytes
             if device.is_cuda and not is_coded:
                 add[device] += _PACKED_BYTES * bundle.num_gaussians
         return add
 
     def num_bytes(self, device: Device) -> int:
-        """Return the memory that gaussians and tables of all bundles occupy on a
-        device, without the bundles themselves."""
+        """Return the memory in bytes that the gaussians and tables of all bundles
+        occupy on a device, without the memory of the bundles themselves."""
         with self.lock:
             all_entries = list(self._entries.values())
         num_bytes = 0
@@ -294,12 +302,13 @@ class Residency:
         return num_bytes
 
     def clear(self) -> None:
-        """Free everything; data is made again when it is requested."""
+        """Free all data; it is created again when it is requested."""
         with self.lock:
             self._entries.clear()
 
     def _draws_codes(self, bundle: Bundle, device: Device) -> bool:
-        """Return whether a bundle's gaussians are codes on the device, and not rows."""
+        """Return whether a device draws the codes of a bundle and not decoded
+        gaussians."""
         if bundle.codes is None or not device.is_cuda:
             return bundle.codes is not None
 
@@ -315,11 +324,11 @@ class Residency:
         return self.once(bundle, ("decoded", device), decoded_bytes) == 0
 
     def once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _T]) -> _T:
-        """Return the entry of a bundle or scene with this key; make it if there is
-        none."""
+        """Return the entry of a bundle or scene with this key; create the entry first
+        if it does not exist."""
         with self.lock:
             if not isinstance(owner, Bundle):
-                owner = Scene.of(owner)  # raises if it is not a scene
+                owner = Scene.of(owner)  # raises an error for anything but a scene
             entries = self._entries.setdefault(owner, {})
             if key not in entries:
                 entries[key] = make()
@@ -328,8 +337,8 @@ class Residency:
     def last(
         self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _T]
     ) -> _T:
-        """Return the result of ``make`` for this value. The result for another value is
-        freed first."""
+        """Return the result of ``make`` for this value, from the cache if the last
+        value was the same. Otherwise the last result is freed first."""
         with self.lock:
             last = self.once(owner, key, _LastResult)
             if last.value != value:
@@ -340,17 +349,17 @@ class Residency:
             return cast(_T, last.result)
 
     def _after_fork(self) -> None:
-        """Reset the state in a child of fork(): another thread of the parent may have
-        held a lock or used an entry."""
+        """Reset the state in a child after fork(), because other threads of the parent
+        may have held a lock or used an entry."""
         self.lock = threading.RLock()
         for entries in self._entries.values():
             for key in [
                 key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED
             ]:
-                # They are not destroyed, because that would wait for threads that the
-                # child does not have.
+                # These entries are never destroyed, because destroying them would wait
+                # for threads that do not exist in the child.
                 self._abandoned.append(entries.pop(key))
 
 
 residency = Residency()
-atexit.register(residency.clear)  # before the driver is unloaded
+atexit.register(residency.clear)  # frees device memory before the driver is unloaded

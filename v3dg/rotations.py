@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from v3dg._numbers import check, floats, one_of, refuse
 from v3dg.cameras import Axis, Floats
 
-# The squares of components beyond these overflow a double, or lose digits to denormal
-# numbers.
+# The squares of larger components overflow a double, and those of smaller ones lose
+# precision.
 _LEAST = 1e-140
 _MOST = 1e140
 
-# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers
-# take it.
+# Quaternions w x y z that turn each axis to -y, which is the up direction of viewers
+# where y points down.
 _HALF = math.sqrt(0.5)
 _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
     "x": (_HALF, 0.0, 0.0, -_HALF),
@@ -27,12 +27,13 @@ _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
     "-z": (_HALF, -_HALF, 0.0, 0.0),
 }
 
-# Largest relative deviation of a matrix from a similarity: files round to a few digits.
+# Largest relative deviation of a matrix from a similarity. It allows for numbers that
+# files round to a few digits.
 _SIMILAR = 1e-4
 
 
 class Similarity(NamedTuple):
-    """I transforms p -> scale * rotation p + position."""
+    """I similarity transforms p -> scale * rotation p + position."""
 
     positions: Floats  # (I, 3)
     quaternions: Floats  # (I, 4) w x y z, unit length
@@ -40,15 +41,15 @@ class Similarity(NamedTuple):
 
 
 def turn_upright(up: Axis) -> Floats:
-    """Return the quaternion (4,) w x y z that turns the axis that is up in an asset to
-    -y; ValueError for another name."""
+    """Return the quaternion (4,) w x y z that turns the up axis of an asset to -y;
+    raise ValueError for an invalid axis."""
     one_of(up, "up", tuple(_TO_UPRIGHT))
     return np.array(_TO_UPRIGHT[up])
 
 
 def turn_between(up: Axis, target: Axis) -> Floats:
-    """Return the quaternion (4,) w x y z that turns one axis to another; between y or z
-    and their opposites, x stays."""
+    """Return the quaternion (4,) w x y z that turns one axis to another. Between y, -y,
+    z and -z, the x axis is unchanged."""
     return product(turn_upright(target) * [1, -1, -1, -1], turn_upright(up))
 
 
@@ -66,12 +67,12 @@ def product_matrix(quaternions: Floats) -> Floats:
 
 
 def similarity_of(matrices: ArrayLike, name: str = "matrix") -> Similarity:
-    """Decompose matrices (4, 4) or (I, 4, 4) that take column vectors by a rotation, a
-    translation and one scale.
+    """Decompose matrices (4, 4) or (I, 4, 4) for column vectors into rotations,
+    translations and uniform scales.
 
     Raises:
-        ValueError: A shape is wrong, a number is not finite, or a matrix is another
-            transform; the message says which.
+        ValueError: A shape is wrong, a number is not finite, or a matrix is any other
+            transform, which the message describes.
     """
     array = floats(matrices, name)
     if array.ndim == 2:
@@ -86,10 +87,10 @@ def similarity_of(matrices: ArrayLike, name: str = "matrix") -> Similarity:
 
 
 def _check_similarities(matrices: Floats, largest: Floats, name: str) -> None:
-    """Raise ValueError that says why one of the matrices (I, 4, 4) is no similarity;
-    ``largest`` are the largest numbers of their linear parts."""
+    """Raise a ValueError that describes why one of the matrices (I, 4, 4) is not a
+    similarity. ``largest`` contains the largest absolute value of each linear part."""
     is_affine = np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0.0) <= _SIMILAR
-    _refuse_first(name, is_affine, lambda row: f"a last row of {_text(matrices[row, 3])}")
+    _refuse_first(name, is_affine, lambda row: f"the last row {_text(matrices[row, 3])}")
     _refuse_first(name, largest > 0, lambda _: "a scale of 0")
     linear = matrices[:, :3, :3] / largest[:, None, None]
     scales = np.linalg.norm(linear, axis=1)
@@ -102,12 +103,13 @@ def _check_similarities(matrices: Floats, largest: Floats, name: str) -> None:
     spreads = np.ptp(scales, axis=1)
     is_uniform = np.asarray(spreads <= _SIMILAR * scales.max(axis=1))
     sizes = scales * largest[:, None]
-    _refuse_first(name, is_uniform, lambda row: f"a scale for each axis: {_text(sizes[row])}")
-    _refuse_first(name, np.linalg.det(linear) > 0, lambda _: "a mirror")
+    _refuse_first(name, is_uniform, lambda row: f"different scales: {_text(sizes[row])}")
+    _refuse_first(name, np.linalg.det(linear) > 0, lambda _: "a reflection")
 
 
 def _refuse_first(name: str, good: NDArray[np.bool_], transform_of: Callable[[int], str]) -> None:
-    """Raise ValueError for the first matrix that is not good."""
+    """Raise ValueError for the first matrix that is not good. ``transform_of`` returns
+    a description of the matrix at an index."""
     if good.all():
         return
     row = int(np.argmin(good))
@@ -116,8 +118,8 @@ def _refuse_first(name: str, good: NDArray[np.bool_], transform_of: Callable[[in
         place = f"{name}[{row}]"
     refuse(
         place,
-        f"a rotation, a translation and one positive scale, got {transform_of(row)}; "
-        "instances cannot be stretched, sheared or mirrored",
+        f"a rotation, a translation and one positive scale, got {transform_of(row)}; instances "
+        "cannot be stretched, sheared or mirrored",
     )
 
 
@@ -126,10 +128,12 @@ def _text(numbers: Floats) -> str:
 
 
 def in_range(quaternions: NDArray[np.floating]) -> Floats:
-    """Return quaternions (..., 4) as doubles whose squares neither vanish nor overflow.
+    """Return quaternions (..., 4) as doubles whose squares neither underflow nor
+    overflow.
 
-    The shortest and the longest are multiplied by a power of two, which rounds nothing.
-    Others stay, and so do zero quaternions and those that are not finite.
+    Very small and very large quaternions are multiplied by a power of two, which is
+    exact. All others are unchanged, including zero quaternions and those that are not
+    finite.
     """
     scaled = np.array(quaternions, np.float64)
     largest = np.abs(scaled).max(axis=-1)
@@ -141,10 +145,10 @@ def in_range(quaternions: NDArray[np.floating]) -> Floats:
 
 
 def normalised(quaternions: NDArray[np.floating]) -> Floats:
-    """Return quaternions (..., 4) of length one, in double precision.
+    """Return quaternions (..., 4) normalised to length one, in double precision.
 
-    Those of length zero stay, and those that are not finite contain NaN. No length is
-    too short or too long.
+    Zero quaternions stay zero, and quaternions that are not finite become NaN. Any
+    other length is valid.
     """
     unit = in_range(quaternions)
     length = np.linalg.norm(unit, axis=-1, keepdims=True)
@@ -165,15 +169,16 @@ def rotation_from_quaternion(quaternions: Floats) -> Floats:
 
 
 def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
-    """Unit quaternion w x y z with w >= 0 of a (3, 3) rotation."""
+    """Return the unit quaternion w x y z, with w >= 0, of a (3, 3) rotation."""
     w, x, y, z = quaternions_from_rotations(np.asarray(rotation, np.float64)[None])[0].tolist()
     return w, x, y, z
 
 
 def quaternions_from_rotations(rotations: Floats) -> Floats:
-    """Unit quaternions (I, 4) w x y z with w >= 0 of rotations (I, 3, 3)."""
-    # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinctions, stable
-    # for any angle.
+    """Return the unit quaternions (I, 4) w x y z, with w >= 0, of rotations (I, 3,
+    3)."""
+    # Bar-Itzhack's method: the quaternion is an eigenvector of a symmetric matrix. It
+    # needs no case distinctions and is stable for any angle.
     trace = np.trace(rotations, axis1=1, axis2=2)
     symmetric = np.broadcast_to(trace[:, None, None], (len(rotations), 4, 4)).copy()
     skew = rotations - rotations.transpose(0, 2, 1)
@@ -185,8 +190,8 @@ def quaternions_from_rotations(rotations: Floats) -> Floats:
 
 
 def quaternion_from_angles(degrees: Sequence[float]) -> tuple[float, float, float, float]:
-    """Unit quaternion w x y z of turns about the fixed axes x, then y, then z; angles
-    (3,) in degrees."""
+    """Return the unit quaternion w x y z of rotations about the fixed axes x, then y,
+    then z; angles (3,) in degrees."""
     x, y, z = np.radians(np.asarray(degrees, np.float64)) / 2
     cos_x, cos_y, cos_z = np.cos([x, y, z]).tolist()
     sin_x, sin_y, sin_z = np.sin([x, y, z]).tolist()

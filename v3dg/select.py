@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value", bound=np.generic)
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
-# px² of screen per gaussian of a coarser cluster; docs/levels.md has the resulting
-# error.
+# px² of screen for each gaussian of a coarser cluster. docs/levels.md lists the errors.
 DEFAULT_TOLERANCE = 3.0
 
-# The fade for sequences of pictures; docs/fades.md has its cost and benefit.
+# The recommended fade for sequences of pictures. docs/fades.md describes its cost and
+# benefit.
 DEFAULT_FADE = 1.02
 _FADE_PX2 = np.float32(_core.fade_filter_px2)
 
@@ -42,16 +42,19 @@ class Selection:
     """The clusters that one view needs, in ascending order of instance, then cluster.
 
     Attributes:
-        scene: The scene of the selection. It may have moved or grown since. After
-            instances were removed, the cut is invalid, and drawing it raises
-            ValueError.
-        instance_ids: (S,) int32, read-only.
-        cluster_ids: (S,) int32, indices in the instance's bundle, read-only.
+        scene: The scene of the selection. Its instances may be moved, and instances may
+            be added. If instances are removed, the cut becomes invalid, and drawing it
+            raises ValueError.
+        instance_ids: (S,) int32 indices of instances, read-only.
+        cluster_ids: (S,) int32 indices of clusters in the instance's bundle, read-only.
         num_gaussians: Number of gaussians in all selected clusters.
-        tolerance: The tolerance in px²; with a budget, the one that meets it.
-        seconds: Wall time of the selection.
-        revision: Revision of the scene at the selection; the current one if None.
-        given_weights: Like `weights`, read-only; None without a fade, when all are 1.
+        tolerance: The tolerance in px² per gaussian; with a budget, the tolerance that
+            meets it.
+        seconds: Wall-clock time of the selection.
+        revision: Revision of the scene at the time of the selection; None means the
+            current revision.
+        given_weights: (S,) weights with which the clusters are drawn, read-only; None
+            without a fade, which means that all weights are 1.
     """
 
     scene: Scene
@@ -72,7 +75,7 @@ class Selection:
                 numbers = np.full(numbers.shape, np.nan)  # the check below rejects NaN
             object.__setattr__(self, "given_weights", np.ascontiguousarray(numbers, np.float32))
         weights = self.weights
-        expected = f"{len(self)} numbers of 0 to 1"
+        expected = f"{len(self)} numbers from 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
         check("given_weights", ((weights >= 0) & (weights <= 1)).all(), f"{expected}, got others")
         for values in (self.instance_ids, self.cluster_ids, weights):
@@ -82,8 +85,8 @@ class Selection:
         return Selection, tuple(getattr(self, field.name) for field in fields(self))
 
     def check(self, revision: tuple[int, int, int]) -> None:
-        """Raise ValueError unless a scene of this revision still has the instances of
-        the cut."""
+        """Raise ValueError if instances were removed from the scene between the
+        selection and this revision."""
         assert self.revision is not None
         if revision[2] != self.revision[2]:
             problem = "instances were removed from the scene after this selection"
@@ -95,20 +98,21 @@ class Selection:
     def gaussians(
         self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "auto"
     ) -> Gaussians:
-        """Return the selected gaussians in the world, N in the order of the selection,
-        for any rasterizer.
+        """Return the N selected gaussians in world space, in the order of the
+        selection, for any rasterizer.
 
-        Spherical harmonics are rotated into the world and multiplied by the tints of
-        the instances, which is exact. The SH degree is the highest of the bundles in
-        the selection. Opacities are multiplied by the weights of their clusters, so
-        that fades work in every rasterizer, and by the opacities of their instances.
+        Spherical harmonics are rotated and multiplied by the tints of the instances,
+        which is exact. The SH degree is the highest of the bundles in the selection.
+        Opacities are multiplied by the weights of their clusters, so that fades work in
+        every rasterizer, and by the opacities of their instances.
 
         Args:
-            origin: (3,) point in the world that means are relative to. Use the camera's
-                position if the scene is so far from zero that float32 is not precise
-                enough.
-            device: ``"cpu"`` returns NumPy arrays, ``"cuda"`` torch tensors there,
-                ``"auto"`` the latter if CUDA works. Both have the same values.
+            origin: (3,) point in the world that is subtracted from all means. Use the
+                camera's position if coordinates are too large for the precision of
+                float32.
+            device: ``"cpu"`` returns NumPy arrays, ``"cuda"`` returns CUDA tensors, and
+                ``"auto"`` returns CUDA tensors if CUDA can be used, else NumPy arrays.
+                The values are the same.
         """
         target = _device.resolve(device)
         shift = vector(origin, "origin")
@@ -150,7 +154,7 @@ class Selection:
 
     @property
     def weights(self) -> npt.NDArray[np.float32]:
-        """(S,) weights in [0, 1] that the clusters are drawn with."""
+        """(S,) weights in [0, 1] with which the clusters are drawn."""
         if self.given_weights is None:
             return np.ones(len(self), np.float32)
         return self.given_weights
@@ -159,9 +163,9 @@ class Selection:
     def filters_px2(self) -> npt.NDArray[np.float32]:
         """(N,) variance of the screen-space filter of each gaussian.
 
-        In a fade, a level 0 without a filter is drawn with 0.05 px² and as
-        `antialiased`. `render` limits this filter to four times a gaussian's own
-        variance, so that many tiny gaussians stay opaque.
+        With a fade, a level 0 without a filter is drawn with a filter of 0.05 px² and
+        with compensated opacities. `render` limits this filter to four times the
+        variance of a gaussian, so that many tiny gaussians stay opaque.
         """
 
         def filter_px2(clusters: Clusters) -> npt.NDArray[np.float32]:
@@ -172,7 +176,7 @@ class Selection:
 
     @property
     def antialiased(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether each gaussian's opacity is compensated for its filter."""
+        """(N,) whether the opacity of each gaussian is compensated for its filter."""
 
         def antialiased(clusters: Clusters) -> npt.NDArray[np.bool_]:
             return self._has_only_fade_filter(clusters) | (clusters.antialiased > 0)
@@ -180,21 +184,21 @@ class Selection:
         return self._per_gaussian(antialiased, np.bool_)
 
     def _has_only_fade_filter(self, clusters: Clusters) -> npt.NDArray[np.bool_]:
-        """Return (C,) whether the fade gives the clusters a filter, because they have
-        none."""
+        """Return (C,) whether a cluster has no filter of its own but gets one from the
+        fade."""
         fades = self.given_weights is not None
         return np.asarray((clusters.level == 0) & (clusters.filter_px2 == 0) & fades)
 
     def _first(self) -> npt.NDArray[np.int64]:
-        """Return (S + 1,) the first gaussian of each selected cluster, then their total
-        number."""
+        """Return (S + 1,) the index of the first gaussian of each selected cluster,
+        followed by the total number of gaussians."""
         return np.concatenate(
             [[0], np.cumsum(self.per_pair(lambda clusters: np.diff(clusters.offset)))]
         )
 
     def per_pair(self, column: Callable[[Clusters], npt.NDArray[_Value]]) -> npt.NDArray[_Value]:
-        """Return (S,) values of the selected clusters from a column (C,) of the tables
-        of their bundles."""
+        """Return (S,) the values of the selected clusters, given a function that
+        returns a column (C,) of the tables of a bundle."""
         scene = copy.copy(self.scene)
         self.check(scene.revision)
         columns = [column(bundle.clusters) for bundle in scene.bundles]
@@ -208,12 +212,13 @@ class Selection:
     def _per_gaussian(
         self, column: Callable[[Clusters], npt.NDArray[_Value]], dtype: type[_Value]
     ) -> npt.NDArray[_Value]:
-        # The dtype is explicit, because a scene without bundles has no column.
+        # The dtype is explicit because a scene without bundles has no column to take it
+        # from.
         return np.repeat(self.per_pair(column).astype(dtype), np.diff(self._first()))
 
 
 class CutOptions(TypedDict, total=False):
-    """The options that determine the cut of a view."""
+    """Arguments that determine the cut of a view."""
 
     tolerance: float | None
     budget: int | None
@@ -251,34 +256,37 @@ def select(
     several.
 
     Exactly one cluster is chosen on every path from a leaf of an instance to its root.
-    Clusters outside the frustum are then left out. Rotating the camera, or moving it
-    together with the scene, changes only what is left out.
+    Chosen clusters outside the frustum are then left out. Rotating the camera, or
+    moving camera and scene together, changes only which clusters are left out.
 
     Args:
-        subject: A scene or a bundle, or its file, which every call opens again.
-        camera: Its model may be any, but the paper's footprint needs a pinhole. For a
-            stereo camera, the cut is detailed enough for the nearer eye and includes
-            everything that either eye may see; this excludes the paper's footprint.
-        tolerance: Screen area in px² per gaussian of a coarser cluster. 0 chooses full
-            detail wherever it covers any area, infinity the coarsest clusters. None
-            means `DEFAULT_TOLERANCE`, or 0 with a budget.
-        budget: Largest number of gaussians of one view. The tolerance is raised, by the
-            same factor for all instances, to the smallest of 2,048 values per octave
-            from which on no cut has more.
-        min_level: No cluster of a finer level is chosen, unless an asset has no coarser
-            one.
-        footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with
-            which several clusters on a path may be chosen.
-        cull: False keeps clusters outside the frustum.
+        subject: A scene or a bundle; or the path of its file, which is opened in every
+            call.
+        camera: Camera of any model. For a stereo camera, the cut is detailed enough for
+            the nearer eye and includes everything that either eye may see. Stereo and
+            distorted cameras cannot be combined with the paper's footprint.
+        tolerance: Largest screen area, in px² per gaussian, at which a coarser cluster
+            replaces finer ones. 0 chooses full detail wherever it covers any area;
+            infinity chooses the coarsest clusters. None means `DEFAULT_TOLERANCE`, or 0
+            with a budget.
+        budget: Largest number of gaussians of one view. If the cut has more, the
+            tolerance is raised, by the same factor for all instances, to the smallest
+            value from which on no cut exceeds the budget. 2,048 values per octave are
+            considered.
+        min_level: Clusters of finer levels than this are not chosen, except from
+            bundles with fewer levels.
+        footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, which
+            may choose several clusters on a path.
+        cull: Whether to leave out clusters outside the frustum.
         fade: Clusters within this factor of the tolerance are drawn on two or more
             levels, with weights that add up to exactly 1 on every path and depend only
             on the view. One level fades in while the other fades out, so that nothing
             pops as the camera moves. A level 0 without its own filter is drawn with a
             low-pass filter of 0.05 px², so that it does not flicker. `DEFAULT_FADE` is
             meant for sequences of pictures; 1 and None choose one cluster on every
-            path. It excludes the paper's footprint.
-        device: The device that selects: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is
-            CUDA if it can be used. All give the same cut.
+            path. A fade cannot be combined with the paper's footprint.
+        device: The device that selects: ``"cpu"``, ``"cuda"``, or ``"auto"``, which
+            means CUDA if it can be used. All devices choose the same cut.
 
     Raises:
         ValueError: The coarsest cut has more gaussians than the budget, ``tolerance``
@@ -302,8 +310,8 @@ def select_by(
     device: Device,
     steps: _core.BudgetSteps | None = None,
 ) -> Selection:
-    """Select for one view; with `steps`, the state of a budget, for the next view of a
-    sequence."""
+    """Select the cut of one view. `steps` is the state of a budget in a sequence of
+    views; None for a single view."""
     check_camera(camera)
     start = time.perf_counter()
     with residency.turn(device):
@@ -337,21 +345,23 @@ def rule_of(
     cull: bool = True,
     fade: float | None = None,
 ) -> _core.Rule:
-    """Return the rule of a selection for the core; raise ValueError for a number that
+    """Return the rule of a selection for the core; raise ValueError for a value that
     `select` does not accept."""
     if tolerance is None:
         tolerance = 0.0
         if budget is None:
             tolerance = DEFAULT_TOLERANCE
-    tolerance = real(tolerance, "tolerance", "0 px² or more", 0)
+    tolerance = real(tolerance, "tolerance", "a number of px² of at least 0", 0)
     if tolerance != np.inf:
         tolerance = min(tolerance, MOST_FLOAT)
     if budget is not None:
-        budget = whole(budget, "budget", "a whole number of gaussians, 0 or more", 0, (1 << 63) - 1)
+        budget = whole(
+            budget, "budget", "a whole number of gaussians of at least 0", 0, (1 << 63) - 1
+        )
     one_of(footprint, "footprint", get_args(Footprint))
     factor = 1.0
     if fade is not None:
-        factor = real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
+        factor = real(fade, "fade", "None or a factor from 1 to 1000", 1, 1000)
     if factor != 1 and footprint == "paper":
         refuse(
             "fade",
@@ -360,7 +370,7 @@ def rule_of(
     return _core.Rule(
         tolerance_px2=tolerance,
         budget=budget,
-        min_level=whole(min_level, "min_level", "a level, 0 or more", 0),
+        min_level=whole(min_level, "min_level", "the index of a level, at least 0", 0),
         footprint=footprint,
         culls=bool(cull),
         fade=factor,
@@ -368,7 +378,7 @@ def rule_of(
 
 
 def over_budget(budget: int, least: int) -> ValueError:
-    """Return the error for a budget that the coarsest cut exceeds; ``least`` is the
-    size of that cut."""
-    expected = f"at least {least} gaussians, which the coarsest cut of this view has"
+    """Return the error for a budget that is smaller than the coarsest cut; ``least`` is
+    the number of gaussians in that cut."""
+    expected = f"at least {least}, the number of gaussians in the coarsest cut of this view"
     return ValueError(f"budget: expected {expected}, got {budget}")

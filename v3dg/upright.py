@@ -1,4 +1,4 @@
-"""The axis that is up: read from a file, or guessed from cameras, from a ground plane,
+"""Determines the axis that points up: from a file, from cameras, from a ground plane,
 or by convention."""
 
 from collections.abc import Mapping
@@ -14,20 +14,20 @@ from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene, Subject
 
 ASSUMED = "as in most trained assets"
-"""The reason that `up_of` returns if nothing is known."""
+"""The reason that `up_of` returns if the axis is unknown and only assumed."""
 
-# With fewer cameras, all of them may be tilted.
+# Fewer cameras than this may all be tilted.
 _MIN_CAMERAS = 3
-# Cosine of the largest angle, 26 degrees, between an axis and a direction that is taken
-# for it.
+# A direction counts as parallel to an axis if the cosine of the angle between them
+# exceeds this value (26 degrees).
 _NEAR_AN_AXIS = 0.9
-# Largest ratio of the thickness of a ground to its smaller extent, as standard
+# Largest thickness of a ground plane relative to its smaller extent, both as standard
 # deviations.
 _FLAT = 0.55
 
 
 def direction_of(axis: Axis) -> tuple[float, float, float]:
-    """The unit vector along an axis."""
+    """Return the unit vector along an axis."""
     sign = 1.0
     if axis[0] == "-":
         sign = -1.0
@@ -41,18 +41,19 @@ def up_of(
     *,
     declared: Declared | None = None,
 ) -> tuple[Axis, str]:
-    """Return the axis that is up in a subject, and the reason, as a phrase.
+    """Return the axis of a subject that points up, and the source of that information
+    as a phrase.
 
-    The first of these that applies: the axis in the file of a scene or a bundle; the
-    direction in which the tops of three or more cameras point; z for other scenes; what
-    the file of an asset declares; the normal of the plane in which the gaussians of
-    level 0 mostly lie, if it is along y or z, as -y or z; else -y, as in most trained
-    assets.
+    These sources are tried in this order: the axis that the file of a scene or a bundle
+    declares; the common upward direction of three or more cameras; z, if the subject is
+    a scene; the axis that the file of an asset declares; the normal of a plane that
+    contains most gaussians of level 0, if the normal is parallel to y (then -y is up)
+    or z; finally -y, as in most trained assets.
 
     Args:
         cameras: Cameras that look at the subject, by name.
-        declared: What the file of an asset declares; None for that of the file which
-            `read_asset` read it from.
+        declared: What the file of an asset declares. None uses the declarations of the
+            file from which `read_asset` read the asset.
     """
     recorded: object = None
     if isinstance(subject, Scene):
@@ -80,18 +81,19 @@ def up_of(
 
 
 def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:
-    """Turn gaussians of which an axis is up so that -y is, as `write_asset` and viewers
-    of files without axes take it; colours turn, too.
+    """Return gaussians rotated so that -y points up, given the axis `up` that does so
+    now. `write_asset`, and viewers of formats without axes, assume that -y is up.
+    Colours are rotated, too.
 
     Raises:
-        ValueError: `up` is no axis.
+        ValueError: `up` is not the name of an axis.
     """
     return _axes.turned(gaussians.numpy(), _axes.axes_of_up(up), _axes.MEMORY)
 
 
 def _middles(subject: Bundle | Gaussians) -> Floats:
-    """Return the centres (N, 3) of gaussians of level 0, or of the clusters of a
-    bundle, of which no page is read."""
+    """Return the centres (N, 3) of gaussians of level 0; for a bundle, the centres of
+    its clusters, for which no page is read."""
     if isinstance(subject, Gaussians):
         return np.asarray(subject.means[:: max(len(subject) // 100_000, 1)], np.float64)
     if not subject.num_levels:
@@ -100,13 +102,14 @@ def _middles(subject: Bundle | Gaussians) -> Floats:
 
 
 def _flat_axis(points: Floats) -> Axis | None:
-    """Return the axis along the normal of the plane that the points lie in, ignoring
-    outliers; None if they lie in no plane."""
+    """Return the axis parallel to the normal of the plane in which the points lie,
+    ignoring outliers; None if they do not lie in a plane."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 16:
         return None
     low, high = np.percentile(points, (5, 95), axis=0)
-    points = points[((points >= low) & (points <= high)).all(axis=1)]  # at least ten
+    # At least ten points remain.
+    points = points[((points >= low) & (points <= high)).all(axis=1)]
     variances, directions = np.linalg.eigh(np.cov(points.T))
     axis = int(np.abs(directions[:, 0]).argmax())
     is_flat = variances[0] < _FLAT**2 * variances[1]

@@ -1,5 +1,4 @@
-"""Videos: files of pictures, which appear when they are complete. They need the extra
-`video`."""
+"""Writes videos as H.264 in .mp4 files. Needs the extra `video`."""
 
 import os
 from collections.abc import Iterable
@@ -13,23 +12,23 @@ from v3dg.pictures import to_8bit
 def write_video(
     path: str | os.PathLike[str], pictures: Iterable[Array], *, fps: int = 30, quality: int = 18
 ) -> int:
-    """Encode pictures one after another as H.264 in an .mp4 file, which appears when it
-    is complete.
+    """Encode a sequence of pictures as H.264 in an .mp4 file. The file appears only
+    when it is complete.
 
     Args:
-        pictures: (H, W, 3) floats in [0, 1], NumPy arrays or torch tensors, all of one
-            size; height and width are even.
-        fps: Pictures a second.
-        quality: Constant rate factor, 0 to 51; smaller is better and larger, 18 shows
-            no difference.
+        pictures: (H, W, 3) floats in [0, 1], as NumPy arrays or torch tensors. All have
+            the same size; height and width are even.
+        fps: Pictures per second.
+        quality: Constant rate factor, 0 to 51. Smaller values give better pictures and
+            larger files; at 18, no difference is visible.
 
     Returns:
         Number of pictures in the video.
 
     Raises:
-        ImportError: The extra is not installed.
-        ValueError: Another suffix, no pictures, or pictures of an odd or a changing
-            size.
+        ImportError: The extra `video` is not installed.
+        ValueError: The suffix is not .mp4, there are no pictures, or the size of a
+            picture is odd or different from the first one.
     """
     av = _extras.load("av")
     check(path, os.fspath(path).endswith(".mp4"), "a file name ending in .mp4")
@@ -43,11 +42,15 @@ def write_video(
             if size is None:
                 size = pixels.shape
                 stream.height, stream.width = size[:2]
-            check("pictures", pixels.shape == size, f"{size} as before, got {pixels.shape}")
+            check(
+                "pictures",
+                pixels.shape == size,
+                f"the shape {size} of the first picture, got {pixels.shape}",
+            )
             is_even = len(size) == 3 and size[0] % 2 == 0 and size[1] % 2 == 0
             check("pictures", is_even, f"an even height and width, got {pixels.shape}")
             video.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
             num_pictures += 1
-        check("pictures", num_pictures, "at least one, got none")
+        check("pictures", num_pictures, "at least one picture, got none")
         video.mux(stream.encode())
     return num_pictures

@@ -1,4 +1,4 @@
-"""The viewer, started from Python."""
+"""Starts the viewer from Python."""
 
 from __future__ import annotations
 
@@ -45,20 +45,21 @@ def view(
     up: Axis | VectorLike | None = None,
     **options: Unpack[_SiteOptions],
 ) -> Site:
-    """Show a scene, a bundle or an asset, or the file of one, in a web browser
+    """Show a scene, a bundle, an asset, or a file with one of them, in a web browser
     (docs/viewer.md).
 
-    The viewer's server runs on threads of this process. Its address is printed, and is
-    the `url` of the returned site; the site's `close()` ends the server.
+    The viewer's server runs on threads of this process. Its address is printed; it is
+    also the `url` of the returned site. The `close()` method of the site ends the
+    server.
 
     Args:
         device: See `v3dg.render`.
         memory: See `v3dg.Renderer`.
-        up: The axis or direction that is up at first; None uses the axis of
+        up: The axis or direction that points up at first; None uses the axis of
             `v3dg.upright.up_of`.
         options: Options of `v3dg.viewer.server.Site`, such as `cameras` by name,
-            `port`, `tolerance`, `budget` and `background`. A scene's file may have
-            cameras of its own.
+            `port`, `tolerance`, `budget` and `background`. Without `cameras`, those in
+            the file of a scene are used.
 
     Raises:
         ImportError: The extra `viewer` is not installed.
@@ -80,5 +81,5 @@ def view(
         one_of(up, "up", AXES)
         up = direction_of(up)
     site = Site(SceneView(subject, device=device, memory=memory), up=up, **options)
-    print(f"{site.url} shows it until close() is called")
+    print(f"{site.url} shows the subject until close() is called")
     return site

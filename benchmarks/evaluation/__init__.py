@@ -1,5 +1,7 @@
-"""The evaluation: speed against error, with other tools in the same run; `python -m
-benchmarks evaluate`."""
+"""The evaluation: speed and error of v3dg and of other tools, measured in one run.
+
+`python -m benchmarks evaluate` starts it.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ def run(
     """Run parts, each of which writes <part>.json when it ends; return their results.
 
     Raises:
-        ValueError: A name is not that of a part.
+        ValueError: There is no part of this name.
     """
     modules = {name: part(name) for name in names}
     evaluation.folder.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
-"""Assets for measurements: many copies of a small one, and random gaussians that look
-trained."""
+"""Assets for measurements: copies of a small asset as one, and random gaussians with
+the statistics of trained ones."""
 
 from __future__ import annotations
 
@@ -16,17 +16,24 @@ from v3dg.rotations import rotation_from_quaternion
 
 
 def read_layout(path: str | Path, bundle: v3dg.Bundle) -> tuple[v3dg.Scene, dict[str, v3dg.Camera]]:
-    """Return a published layout of one asset, whose bundle is given, and its
-    cameras."""
+    """Read a published layout of one asset.
+
+    Args:
+        path: The layout, a JSON file.
+        bundle: The bundle of the asset.
+
+    Returns:
+        The scene, and the layout's cameras by name.
+    """
     name = json.loads(Path(path).read_text(encoding="utf-8"))["asset"]
     return v3dg.read_scene(path, bundles={name: bundle})
 
 
 def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Return copies of an asset as one asset: rotated at random, half to twice as
-    large, side by side on a square.
+    """Return copies of an asset as one asset, side by side on a square, rotated at
+    random, and scaled by 1/2 to 2.
 
-    The view-dependent part of the colour is not rotated with them.
+    The view-dependent part of the colour is not rotated with the copies.
     """
     rng = np.random.default_rng(seed)
     side = math.isqrt(num_copies - 1) + 1
@@ -57,7 +64,8 @@ def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3d
 
 
 class _Random:
-    """Seeded float32 numbers on a device: NumPy's on the CPU, torch's on others."""
+    """Random float32 numbers from a seed, made by NumPy on the CPU and by torch on
+    other devices."""
 
     def __init__(self, device: str, seed: int) -> None:
         self._device = device
@@ -89,16 +97,17 @@ class _Random:
 def like_trained(
     count: int, camera: v3dg.Camera, device: str, *, sh_degree: int = 0, seed: int = 0
 ) -> v3dg.Gaussians:
-    """Return random gaussians before a camera with the sizes, shapes and opacities of
-    training.
+    """Return random gaussians in front of a camera, with the sizes, shapes and
+    opacities of a trained asset.
 
-    The distributions are fitted to a trained asset: logs of sizes are normal with
-    deviation 1, logs of the ratios of neighbouring axes are gamma of shape 3 (median
-    ratios 3 and 4), logits of opacities are normal. Training distributes gaussians by
-    visibility, so sizes on screen do not depend on depth: the longest axis has a median
-    of 2 px (the middle one 0.7 px), and one in a thousand exceeds 40 px. Depths are
-    log-uniform over a factor of 20, positions uniform on the image and slightly beyond
-    it. The result has NumPy arrays on the CPU, else tensors.
+    The distributions were fitted to a trained asset: logarithms of sizes are normal
+    with deviation 1; logarithms of the ratios of neighbouring axes have a gamma
+    distribution of shape 3 (median ratios 3 and 4); logits of opacities are normal.
+    Training distributes gaussians by visibility, so sizes on screen do not depend on
+    depth: the longest axis has a median of 2 px (the middle axis 0.7 px), and it
+    exceeds 40 px for one gaussian in a thousand. Depths are log-uniform over a factor
+    of 20. Positions are uniform on the image and slightly beyond its borders. Arrays
+    are NumPy arrays on the CPU, and tensors on other devices.
     """
     random = _Random(device, seed)
     uniform, normal, array = random.uniform, random.normal, random.array
@@ -110,7 +119,8 @@ def like_trained(
     means = view @ array(camera.viewmat[:3, :3]) + array(camera.position)
 
     longest = 2 * exp(normal(count, 1)) * depth / camera.fx
-    # A uniform number may be 0, so one minus it is never 0.
+    # A uniform number may be 0, but 1 minus the number is never 0, so its logarithm is
+    # finite.
     ratios = exp(array([0.4, 0.5]) * random.library.log(1 - uniform(count, 3, 2)).sum(1))
     middle = longest * ratios[:, :1]
     sh = join(
@@ -126,8 +136,8 @@ def like_trained(
 
 
 def hair_lines(count: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Return bent wires in a ball of radius 1, with a thickness of 1/3,000 of the
-    radius, which fall between pixels."""
+    """Return bent wires in a ball of radius 1. They are 1/3,000 of the radius thick,
+    thin enough to fall between pixels."""
     rng = np.random.default_rng(seed)
     wires = max(4, count // 100)
     wire = np.arange(count) % wires
@@ -148,8 +158,8 @@ def hair_lines(count: int, *, seed: int = 0) -> v3dg.Gaussians:
 
 
 def sky_dome(count: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Return huge soft gaussians on half a sphere of radius 1: blue above, haze at the
-    horizon, clouds."""
+    """Return huge soft gaussians on a hemisphere of radius 1: a blue sky, haze at the
+    horizon, and clouds."""
     rng = np.random.default_rng(seed)
     z = (np.arange(count) + 0.5) / count
     turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
@@ -171,8 +181,10 @@ def sky_dome(count: int, *, seed: int = 0) -> v3dg.Gaussians:
 
 
 def _quats_from_x(x: Any) -> Any:
-    """Return rotations from the x axis to unit vectors: half a turn about the middle
-    between the two."""
+    """Return quaternions of rotations from the x axis to unit vectors.
+
+    Each is half a turn about the bisector of the x axis and the vector.
+    """
     middle = x + np.array([1.0, 0.0, 0.0])
     middle[np.linalg.norm(middle, axis=1) < 1e-6] = [0.0, 1.0, 0.0]
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)

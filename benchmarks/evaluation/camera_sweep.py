@@ -1,4 +1,4 @@
-"""Rows of tables about builds: means over the distances of the camera sweep."""
+"""Rows of the tables about builds: means over the distances of the camera sweep."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ def full_row(evaluation: Evaluation) -> Row:
 
 
 def build_row(evaluation: Evaluation, name: str, config: BuildConfig, tolerance: float) -> Row:
-    """Return the result of this build at this tolerance, and its cost."""
+    """Build with these settings; return the means over the sweep at this tolerance, and
+    the cost of the build."""
     built = evaluation.build(config)
     shots = evaluation.shoot_sweep(evaluation.place(built.bundle), tolerance)
     row = sweep_row(evaluation, name, tolerance, evaluation.sweep_rows(shots, "drawn"))
@@ -23,8 +24,8 @@ def build_row(evaluation: Evaluation, name: str, config: BuildConfig, tolerance:
 
 
 def as_many_row(evaluation: Evaluation, name: str, config: BuildConfig, rival: Row) -> Row:
-    """Return the result of this build with at most as many gaussians as another row,
-    view by view."""
+    """Return the means for this build, drawn in each view with at most as many
+    gaussians as in `rival`."""
     built = evaluation.build(config)
     scene = evaluation.place(built.bundle)
     shots = [

@@ -1,4 +1,4 @@
-"""`python -m benchmarks evaluate`."""
+"""The command `python -m benchmarks evaluate`."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from v3dg.cli._common import Flag, Threads, UsageError, option, print_result, re
 
 @dataclass
 class Evaluate:
-    """Measure speed against error, beside peers, and write JSON, tables and pictures
-    (docs/results.md)."""
+    """Measure speed and error of v3dg and of other tools, and write JSON, tables and
+    pictures (docs/results.md explains them)."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("evaluation")
-    """Folder for the results; made if it is not there."""
+    """Folder for the results; created if it does not exist."""
     preset: Literal["small", "full"] = "small"
-    """small takes minutes on two cores, full needs a GPU."""
+    """Amount of work: small takes minutes on two cores, full needs a GPU."""
     parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
-    """Parts of the evaluation to run; all if not given."""
+    """Parts of the evaluation to run; by default all."""
     scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
-    """Composed scenes to draw; all if not given."""
+    """Composed scenes to draw; by default all."""
     asset: Annotated[Path | None, option("PATH")] = None
-    """Trained asset, a .ply file, in place of the one that is made here."""
+    """Trained asset, a .ply file, to use instead of the generated one."""
     layout: Annotated[Path | None, option("PATH")] = None
-    """Published layout (.json) of the instances of that asset and of cameras."""
+    """Published layout (.json) with instances of that asset and cameras."""
     peers: Annotated[Path | None, option("FOLDER")] = None
-    """Levels of that asset that other tools made (described in
-    benchmarks/evaluation/parts/merging.py)."""
+    """Folder with levels of that asset made by other tools
+    (benchmarks/evaluation/parts/merging.py describes the files)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to build and draw on; auto is a CUDA device if there is one and torch can
-    use it."""
+    """Device for builds and pictures; auto is a CUDA device if torch can use one, else
+    the CPU."""
     seed: int = 0
-    """Seed of assets, layouts and builds."""
+    """Seed of the assets, layouts and builds."""
     threads: Threads = None
-    """CPU threads; all if not given."""
+    """Number of CPU threads; by default one for each core."""
     json: Flag = False
     """Print the results as JSON."""
     quiet: Flag = False
@@ -49,7 +49,10 @@ def run(options: Evaluate) -> None:
         if path is not None:
             require_file(path, suffix)
     if options.layout is not None and options.asset is None:
-        raise UsageError("--layout: expected --asset with it, the asset that it places")
+        raise UsageError(
+            "--layout: expected together with --asset, got no --asset; give the asset that the "
+            "layout places"
+        )
     from benchmarks import evaluation
     from v3dg import _device
 

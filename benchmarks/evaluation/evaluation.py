@@ -1,5 +1,5 @@
-"""The shared state of the evaluation's parts: assets, bundles, and the main scene with
-its views and true pictures."""
+"""The state that the parts of the evaluation share: assets, bundles, and the main scene
+with its views and reference pictures."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-FOV_X = math.pi / 4  # the paper's value
+FOV_X = math.pi / 4  # radians; the horizontal field of view in the paper
 _MOST_PICTURE_PX = 1400, 2000
 PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
 
 
 def paper_tolerance(tau_px2: float) -> float:
-    """Return our tolerance, px² per gaussian, for the paper's, px² of a group that is
-    drawn as one cluster."""
+    """Convert a tolerance of the paper to a tolerance of v3dg.
+
+    The paper measures px² of a group that is drawn as one cluster, v3dg px² per
+    gaussian.
+    """
     return tau_px2 / PAPER_CLUSTER_SIZE
 
 
@@ -50,7 +53,7 @@ PAPER_TOLERANCE = paper_tolerance(2048)
 @dataclass(frozen=True)
 class View:
     """A camera that looks at the origin, and its position: azimuth and elevation in
-    degrees, distance in world units."""
+    degrees, and distance in world units."""
 
     azimuth: float
     elevation: float
@@ -72,7 +75,7 @@ def views_of(cameras: Iterable[Camera]) -> list[View]:
         distance = math.sqrt(x * x + y * y + z * z)
         azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.asin(z / distance))
         # Files round angles: a value just below 0 must not become a separate direction
-        # at 360.
+        # at 360 degrees.
         views.append(View(round(azimuth, 2) % 360, elevation, distance, camera))
     return views
 
@@ -89,21 +92,21 @@ def orbit_view(azimuth: float, elevation: float, distance: float, size: tuple[in
 
 
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Return the same view with this number of pixels."""
+    """Return the same camera with another picture size, (width, height) in px."""
     factors = np.array([[size[0] / camera.width], [size[1] / camera.height], [1.0]])
     return replace(camera, K=camera.K * factors, width=size[0], height=size[1])
 
 
 def close_distance(asset: Gaussians) -> tuple[Any, float]:
-    """Return the middle of an asset, and the distance at which it fills a square
-    picture, ignoring outliers."""
+    """Return the centre of an asset without its outliers, (3,), and the distance at
+    which the asset fills a square picture."""
     center, radius = ball_of_most(_device.to_host(asset.means))
     return center, radius / math.tan(FOV_X / 2)
 
 
 def close_view(asset: Gaussians, size: tuple[int, int]) -> Camera:
-    """Return a camera in which the asset fills the picture, from the front and
-    above."""
+    """Return a camera in front of the asset and above it, at the distance where the
+    asset fills the picture."""
     center, distance = close_distance(asset)
     eye = center + distance * np.array([0.0, -0.8, 0.6])
     return Camera.look_at(
@@ -119,8 +122,8 @@ class Built:
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture that was drawn twice with equal bytes, its statistics, and the time in
-    between."""
+    """The measurement of one view: picture, statistics and time. The picture is drawn
+    before and after the timed runs, with equal bytes."""
 
     view: View
     picture: Picture
@@ -145,14 +148,14 @@ class Evaluation:
     folder: Path
     seed: int = 0
     scenes: tuple[str, ...] = ()
-    """Names of the composed scenes that are drawn; all by default."""
+    """Names of the composed scenes to draw; all if empty."""
     asset_path: Path | None = None
     layout_path: Path | None = None
     peers: Path | None = None
-    """Folder with what other tools made of the asset: <asset>_<percent>.ply and so on,
-    see part "merging"."""
+    """Folder with levels of the asset made by other tools: <asset>_<tool>_<percent>.ply
+    and seconds.json (see parts/merging.py)."""
     pictures: list[str] = field(default_factory=list)
-    """File names that the current part has saved."""
+    """Names of the files that the current part has saved."""
     judge: Judge = field(default_factory=Judge)
     _built: dict[str, Built] = field(default_factory=dict)
     _truths: dict[int, Picture] = field(default_factory=dict)
@@ -168,8 +171,8 @@ class Evaluation:
         return "made_donut" if self.asset_path is None else self.asset_path.stem
 
     def warm_up(self) -> None:
-        """Load everything that the first build and the first picture load, so that no
-        part includes this time."""
+        """Load everything that the first build and the first picture need, so that no
+        part's time includes loading."""
         tiny = make_asset(1000)
         bundle = build_bundle(
             tiny, config=BuildConfig(steps=2), progress=False, device=self._device
@@ -181,7 +184,8 @@ class Evaluation:
         return self.device
 
     def build(self, config: BuildConfig | None = None, asset: Gaussians | None = None) -> Built:
-        """Build the main asset or another one; bundles of the main asset are cached."""
+        """Build an asset, by default the main one. Bundles of the main asset are
+        cached."""
         config = config or BuildConfig()
         key = json.dumps(asdict(config))
         if asset is None and key in self._built:
@@ -200,8 +204,8 @@ class Evaluation:
         return built
 
     def place(self, bundle: Bundle, instances: int | None = None) -> Scene:
-        """Return the main scene, made of this bundle; with `instances`, only the first
-        ones."""
+        """Return the main scene with this bundle; `instances` limits it to its first
+        instances."""
         scene = Scene()
         positions, quaternions, scales = self._layout[0]
         few = slice(instances)
@@ -229,17 +233,17 @@ class Evaluation:
 
     @cached_property
     def full_scene(self) -> Scene:
-        """Return the main scene, restricted to level 0."""
+        """Return the main scene with the bundle of the default settings."""
         return self.place(self.build().bundle)
 
     @cached_property
     def all_views(self) -> list[View]:
-        """Return all views of the main scene that the settings request."""
+        """Return the views of the main scene that the settings request."""
         return self._some_of(self._layout[1])
 
     def _some_of(self, views: Sequence[View]) -> list[View]:
-        """Return those of the paper's 400 views that have the settings' directions,
-        elevations and distances."""
+        """Return the views, of the paper's 400, that have the directions, elevations
+        and distances of the settings."""
         azimuths = sorted({round(v.azimuth) for v in views})[: self.settings.directions]
         lines: dict[tuple[int, int], list[View]] = {}
         for view in views:
@@ -264,7 +268,8 @@ class Evaluation:
         return every(line, self.settings.sweep_distances)
 
     def truth(self, index: int) -> Picture:
-        """Return the true picture of a view of the camera sweep."""
+        """Return the reference picture of a view of the camera sweep: supersampled,
+        with all gaussians."""
         if index not in self._truths:
             self._truths[index] = draw_truth(
                 self.full_scene, self.camera_sweep[index].camera, self.device
@@ -278,8 +283,11 @@ class Evaluation:
         tolerance: float = DEFAULT_TOLERANCE,
         repeats: int | None = None,
     ) -> Shot:
-        """Draw, measure, and draw again: the time counts only if the pictures are
-        equal."""
+        """Draw a view, time it, and draw it again.
+
+        Raises:
+            RuntimeError: The picture is black, or the two pictures differ.
+        """
 
         def draw() -> Any:
             return render(subject, view.camera, tolerance=tolerance, device=self.device)
@@ -287,14 +295,15 @@ class Evaluation:
         picture = to_8bit(draw().color)
         if not picture.any():
             raise RuntimeError(
-                f"picture at distance {view.distance:g}: expected something in it, got black"
+                f"picture at distance {view.distance:g}: expected a visible scene, got a black "
+                "picture"
             )
         timed = time_ms(lambda: draw().stats, self.device, repeats or self.settings.repeats)
         last = draw()
         if not np.array_equal(picture, to_8bit(last.color)):
             raise RuntimeError(
-                f"picture at distance {view.distance:g}: expected the same on every run, got "
-                "another"
+                f"picture at distance {view.distance:g}: expected the same bytes in every run, got "
+                "different ones"
             )
         return Shot(view, picture, last.stats, timed)
 
@@ -303,16 +312,18 @@ class Evaluation:
 
     @cached_property
     def full_sweep(self) -> list[Shot]:
-        """Return the camera sweep with all gaussians at one sample per pixel, which
-        level of detail has to beat."""
+        """Return the camera sweep with all gaussians at one sample per pixel, the
+        baseline for levels of detail."""
         return self.shoot_sweep(self.full_scene, 0.0)
 
     def judge_sweep(self, shots: Sequence[Shot]) -> list[Row]:
-        """Return FLIP and PSNR of pictures of the camera sweep, in its order."""
+        """Return FLIP and PSNR of pictures of the camera sweep, in the order of its
+        views."""
         return self.judge.errors((self.truth(i), shot.picture) for i, shot in enumerate(shots))
 
     def sweep_rows(self, shots: Sequence[Shot], name: str) -> list[Row]:
-        """Return a row per view: its position, statistics, time and error."""
+        """Return a row per view: its position, and the statistics, time and error of
+        its picture."""
         errors = self.judge_sweep(shots)
         return [
             {
@@ -324,7 +335,7 @@ class Evaluation:
         ]
 
     def composed_scenes(self) -> Iterator[tuple[str, Scene, list[View]]]:
-        """Yield the composed scenes and their views."""
+        """Yield the name, scene and views of each composed scene."""
         name = self._main_world.name if self.layout_path is None else self.layout_path.stem
         if not self.scenes or name in self.scenes:
             yield name, self.full_scene, self.all_views
@@ -367,7 +378,7 @@ class Evaluation:
 
 
 def every(items: Sequence[Any], count: int) -> list[Any]:
-    """Return this many of the items, evenly spaced and always with the last; all if
+    """Return `count` of the items, evenly spaced and including the last; all items if
     there are no more."""
     if count >= len(items):
         return list(items)

@@ -1,4 +1,4 @@
-"""Shared parts of the benchmarks on a GPU: memory, errors, and gsplat for
+"""Shared parts of the benchmarks on a GPU: memory, errors, and pictures by gsplat for
 comparison."""
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ DEVICE = "cuda"
 
 
 class PeakMemory:
-    """The peak of GPU memory in a `with` block, without that of an idle process:
-    `.gigabytes`.
+    """Measures the peak of GPU memory in a `with` block, beyond that of an idle
+    process.
 
-    The driver is sampled every few milliseconds; it reports everybody's allocations,
-    and the memory that pools hold.
+    The result is in `gigabytes`. Free memory is read from the driver every few
+    milliseconds, so allocations of other processes and the caches of memory pools
+    count, too.
     """
 
     _idle = 0
@@ -58,7 +59,8 @@ class PeakMemory:
 
 
 def picture_error(picture: Any, truth: Any) -> dict[str, float]:
-    """Return the error of a picture relative to another, both clipped to [0, 1]."""
+    """Return the error of a picture against a reference, with both pictures clipped to
+    [0, 1]."""
     import torch
 
     picture, truth = (torch.as_tensor(p, device=DEVICE).clamp(0, 1) for p in (picture, truth))
@@ -73,8 +75,10 @@ def picture_error(picture: Any, truth: Any) -> dict[str, float]:
 
 
 def placed_gaussians(scene: Scene, device: str = DEVICE) -> v3dg.Gaussians:
-    """Return all instances of a scene of one bundle, in full detail, in the world, as
-    tensors of SH degree 0."""
+    """Return all instances of a scene with one bundle, at full detail, in world space.
+
+    The result has tensors, and colours of SH degree 0.
+    """
     import torch
 
     asset = scene.bundles[0].level_gaussians(0).torch(device)
@@ -99,7 +103,8 @@ def placed_gaussians(scene: Scene, device: str = DEVICE) -> v3dg.Gaussians:
 
 
 def _left_products(quaternions: Any) -> Any:
-    """Return (I, 4, 4) matrices that multiply by a quaternion from the left."""
+    """Return (I, 4, 4) matrices that multiply quaternions by the given ones from the
+    left."""
     import torch
 
     w, x, y, z = torch.as_tensor(quaternions).unbind(-1)
@@ -108,12 +113,13 @@ def _left_products(quaternions: Any) -> Any:
 
 
 def has_gsplat() -> bool:
-    """Return whether gsplat can be measured; results state its version, or omit it."""
+    """Return whether gsplat is installed, so that it can be measured."""
     return importlib.util.find_spec("gsplat") is not None
 
 
 def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time:
-    """Measure a frame of gsplat, packed and not; the faster one counts."""
+    """Measure a frame of gsplat in its packed and unpacked modes; return the faster
+    one."""
 
     import torch
 
@@ -127,17 +133,17 @@ def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time
 def gsplat_picture(
     gaussians: v3dg.Gaussians, camera: Camera, *, packed: bool, eps2d: float = 0.0
 ) -> tuple[Any, Any]:
-    """Return colour (H, W, 3) and alpha (H, W) as gsplat draws them; differentiable."""
+    """Return colour (H, W, 3) and alpha (H, W) as drawn by gsplat; differentiable."""
     return gsplat_frame(gaussians, camera, packed=packed, eps2d=eps2d)()
 
 
 def gsplat_frame(
     gaussians: v3dg.Gaussians, camera: Camera, *, packed: bool, eps2d: float = 0.0
 ) -> Callable[[], tuple[Any, Any]]:
-    """Return a call that draws `gsplat_picture`, with all its inputs on the GPU.
+    """Return a function that draws `gsplat_picture` from inputs that are on the GPU.
 
-    Colours that do not depend on the view are passed directly, which saves gsplat a
-    pass.
+    Colours that do not depend on the view are passed directly, which spares gsplat a
+    pass over the gaussians.
     """
     import gsplat
     import torch

@@ -1,11 +1,12 @@
-"""A hierarchy of single gaussians as a baseline: Kerbl et al., A Hierarchical 3D
-Gaussian Representation.
+"""A hierarchy of single gaussians as a baseline, after Kerbl et al., A Hierarchical 3D
+Gaussian Representation (SIGGRAPH 2024).
 
-Written from the paper (SIGGRAPH 2024), without its optimisation against photographs,
-which these assets do not have. A binary tree by median splits, down to single
-gaussians. An inner node merges its two children by their moments, weighted by opacity
-times surface. A node is drawn if its size on screen is at most the target and its
-parent's is not; it is interpolated towards its parent, so that nothing jumps.
+This implementation follows the paper. It omits the optimisation against photographs,
+because the benchmark's assets have no photographs. The hierarchy is a binary tree that
+is built by median splits, down to single gaussians. An inner node merges its two
+children by their moments, with weights of opacity times surface. A node is drawn if its
+size on screen is at most the target size and its parent's size is larger. Drawn nodes
+are interpolated towards their parents, so that pictures change continuously.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ from v3dg.scene import Scene
 
 Ids = npt.NDArray[np.int64]
 
-_SIZES_AT_ONCE = 1 << 25  # (instance, node) pairs
+_SIZES_AT_ONCE = 1 << 25  # number of (instance, node) pairs that are processed together
 _MOST_ALPHA = 0.999
 _LEAST_STEP_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
-    """M nodes, level by level from the root, on the host.
+    """M nodes of a hierarchy on the host, level by level from the root.
 
     Attributes:
         gaussians: The gaussian of each node; opacities of inner nodes may exceed 1, as
             in the paper.
-        parent: (M,) the node above; the root is its own parent.
-        num_siblings: (M,) children of the parent, the node itself included.
-        box: (M, 2, 3) box around the visible extent of the leaves below.
-        num_leaves: Number of the asset's gaussians, which are the last nodes.
+        parent: (M,) index of each node's parent; the root is its own parent.
+        num_siblings: (M,) number of children of the node's parent, including the node.
+        box: (M, 2, 3) box around the visible extent of the leaves below a node.
+        num_leaves: Number of gaussians of the asset. These are the last nodes.
     """
 
     gaussians: Gaussians
@@ -52,7 +53,7 @@ class Hierarchy:
 
 
 def build_hierarchy(asset: Gaussians) -> Hierarchy:
-    """Build the tree of one asset, given as NumPy arrays."""
+    """Build the tree of one asset, whose arrays are NumPy arrays."""
     count = len(asset)
     order, offset = _core.median_split(
         asset.means, np.array([0, count]), _core.num_halvings(count, 1)
@@ -61,8 +62,8 @@ def build_hierarchy(asset: Gaussians) -> Hierarchy:
     leaves = asset.subset(order)
     levels = [leaves]
     boxes = [_core.bound_by_boxes(leaves.rows, np.arange(len(leaves) + 1))]
-    # Some of the segments after the last split are empty; above it, every node has two
-    # children.
+    # Some segments of the last split may be empty; on all levels above, every node has
+    # two children.
     parents = [np.repeat(np.arange(len(offset) - 1), np.diff(offset)) // 2]
     for k in range(depth - 1, -1, -1):
         first_child = offset[::2].copy() if k == depth - 1 else 2 * np.arange(2**k + 1)
@@ -87,8 +88,8 @@ def build_hierarchy(asset: Gaussians) -> Hierarchy:
 
 
 def _merge(children: Gaussians, first_child: Ids) -> Gaussians:
-    """Join segments of one or two gaussians by their moments; opacity times surface is
-    preserved, even beyond opacity 1."""
+    """Merge segments of one or two gaussians by their moments. Opacity times surface is
+    preserved, so merged opacities may exceed 1."""
     merged = Gaussians(*_core.merge(children.rows, first_child, np.arange(len(first_child))))
     weight = np.add.reduceat(children.opacities * _surface(children.scales), first_child[:-1])
     opacities = weight / np.maximum(_surface(merged.scales), np.float32(1e-30))
@@ -96,14 +97,15 @@ def _merge(children: Gaussians, first_child: Ids) -> Gaussians:
 
 
 def _surface(scales: Any) -> Any:
-    """Return the surface area of ellipsoids over 4 pi, after Thomsen, within 1.1 %."""
+    """Return the surface area of ellipsoids divided by 4 pi, by Thomsen's formula, with
+    an error of at most 1.1 %."""
     p = 1.6075
     x, y, z = (scales**p).T
     return ((x * y + x * z + y * z) / 3) ** (1 / p)
 
 
-# The 24 rotations that map axes to axes, as quaternions, and the permutation of axes of
-# each.
+# The 24 rotations that map coordinate axes to coordinate axes, as quaternions;
+# `_AXIS_AT` has the permutation of axes of each rotation.
 _TURNS = np.array(
     [
         np.array(q) / np.linalg.norm(q)
@@ -115,8 +117,8 @@ _AXIS_AT = np.abs(rotation_from_quaternion(_TURNS)).argmax(axis=1)  # (24, 3)
 
 
 def _match_axes(nodes: Gaussians, level: slice, parent: Ids) -> None:
-    """Permute the axes of a level's gaussians so that their rotations are closest to
-    their parents'."""
+    """Permute the axes of a level's gaussians such that their rotations are as close as
+    possible to the rotations of their parents."""
     child = nodes.quats[level] / np.linalg.norm(nodes.quats[level], axis=1, keepdims=True)
     above = nodes.quats[parent[level]]
     back = child * [1, -1, -1, -1]
@@ -142,7 +144,7 @@ def _product(a: Any, b: Any) -> Any:
 
 
 class HierarchyScene:
-    """One hierarchy in all instances of a scene, on a device."""
+    """The instances of a scene on a device, each drawn from one hierarchy."""
 
     def __init__(self, hierarchy: Hierarchy, scene: Scene, device: str) -> None:
         self.scene, self._device = scene, _device.resolve(device)
@@ -160,8 +162,13 @@ class HierarchyScene:
         return like(values, self._nodes.means)
 
     def cut(self, camera: Camera, target_px: float) -> tuple[Any, Any, Any]:
-        """Return instances, nodes, and the interpolation of each towards its parent,
-        for nodes of at most this size."""
+        """Select nodes whose size is at most the target and whose parent's size exceeds
+        it.
+
+        Returns:
+            Indices of instances and of nodes, and each node's interpolation weight
+            towards its parent, 0 to 1.
+        """
         scene = self.scene
         eyes = (
             np.einsum("ij,ijk->ik", camera.position - scene.positions, scene.rotations)
@@ -183,7 +190,8 @@ class HierarchyScene:
         for axis in range(3):
             eye = eyes[:, axis, None]
             square = square + ((low[:, axis] - eye).clip(0) + (eye - high[:, axis]).clip(0)) ** 2
-        size = focal * self._extent / (square**0.5 + 1e-30)  # of the nearest point of the box, px
+        # Px, at the nearest point of the box.
+        size = focal * self._extent / (square**0.5 + 1e-30)
         fits = size <= target_px
         fits[:, self._first_leaf :] = True
         above = fits[:, self._parent]
@@ -196,12 +204,12 @@ class HierarchyScene:
         return instance + first, node, way
 
     def gaussians(self, cut: tuple[Any, Any, Any]) -> Gaussians:
-        """Return the nodes of a cut in the world, interpolated towards their
+        """Return the gaussians of a cut in world space, interpolated towards their
         parents."""
         instance, node, way = cut
         own, above = self._gather(instance, node), self._gather(instance, self._parent[node])
-        # This opacity makes siblings that are drawn over each other as their parent
-        # cover together what it covers.
+        # Siblings with this opacity that are drawn over each other together cover as
+        # much as their parent does alone.
         shared = 1 - (1 - above.opacities.clip(0, _MOST_ALPHA)) ** (1 / self._siblings[node])
         to = way[:, None]
         return Gaussians(

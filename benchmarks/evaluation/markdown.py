@@ -1,4 +1,4 @@
-"""Tables in Markdown, from the rows of a result."""
+"""Markdown tables from the rows of a result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.evaluation.measure import Row
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: the key in a row, the title, and the format, such as ".3f"
+    """A column of a table: the title, the key in a row, and the format, such as ".3f"
     or "count"."""
 
     title: str
@@ -28,7 +28,7 @@ class Column:
 
 
 def count_text(count: float) -> str:
-    """Return a count to three digits: 940, 12.3 k, 4.56 M."""
+    """Return a count with three digits, such as 940, 12.3 k or 4.56 M."""
     for factor, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if count >= factor:
             return f"{count / factor:.3g}{unit}"

@@ -1,5 +1,5 @@
-"""Measurements: times of calls, errors of pictures, tolerances at equal counts, and
-gaussians removed by clipping."""
+"""Measurements: times of calls, errors of pictures, tolerances at equal counts of
+gaussians, and the radii by which gsplat clips gaussians."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ from v3dg.select import select
 Row = dict[str, Any]
 
 COARSEST = 1e9
-"""Tolerance in px² of the coarsest cut, as a number that JSON can represent.
-"""
+"""Tolerance in px² that selects the coarsest cut of any bundle; a finite number,
+because JSON has no infinity."""
 
 _WARM_UPS = 1
 _HALVINGS = 30
-# gsplat 1.5: a gaussian ends at an alpha of 1/255, and at 3.33 standard deviations.
+# In gsplat 1.5, a gaussian ends at an alpha of 1/255 and at 3.33 standard deviations.
 _MIN_ALPHA, _REACH_SIGMAS = 1 / 255, 3.33
-# Fraction of half the picture, on each side, up to which the projection is linearised.
+# The projection is linearised at most this fraction of half the picture beyond each
+# border.
 _FRUSTUM_MARGIN = 0.15
 
 
 @dataclass(frozen=True)
 class Time:
-    """Milliseconds of one call: the median of several, the minimum and the maximum."""
+    """Milliseconds of repeated calls: the median, the minimum and the maximum."""
 
     median: float
     least: float
@@ -50,8 +51,11 @@ class Time:
 
 
 def time_ms(call: Callable[[], Any], device: str, repeats: int) -> Time:
-    """Measure single calls from idle device to idle device, after a warm-up, including
-    Python's part."""
+    """Measure single calls after a warm-up.
+
+    Each call is measured from idle device to idle device, so Python's overhead is
+    included.
+    """
     for _ in range(_WARM_UPS):
         call()
     times = times_ms(call, device, repeats)
@@ -84,7 +88,7 @@ def _cuda_ms(call: Callable[[], Any]) -> float:
 
 
 def crop(picture: Picture, side: int) -> Picture:
-    """Return the middle of a picture, at most this many px wide and high."""
+    """Return the middle of a picture, at most `side` px wide and high."""
     height, width = picture.shape[:2]
     top, left = max(0, (height - side) // 2), max(0, (width - side) // 2)
     return picture[top : top + side, left : left + side]
@@ -96,12 +100,12 @@ def _flip_and_psnr(pair: tuple[Picture, Picture]) -> tuple[float, float]:
 
 
 class Judge(Judges):
-    """FLIP and PSNR of many pairs of pictures, on all cores; must not run during time
-    measurements."""
+    """Computes FLIP and PSNR of many pairs of pictures on all cores, so it must not run
+    while times are measured."""
 
     def errors(self, pairs: Iterable[tuple[Picture, Picture]]) -> list[Row]:
-        """Return {"flip", "psnr"} of each (truth, picture); PSNR is None for equal
-        pictures."""
+        """Return a row with "flip" and "psnr" for each (reference, picture). PSNR is
+        None for equal pictures."""
         return [
             {"flip": round(flip, 5), "psnr": round(psnr, 2) if math.isfinite(psnr) else None}
             for _, (flip, psnr) in self.measured(pairs, _flip_and_psnr)
@@ -109,16 +113,16 @@ class Judge(Judges):
 
 
 def tolerance_for(scene: Scene, camera: Camera, count: int) -> float:
-    """Return the tolerance at which at most `count` gaussians are selected; `COARSEST`
-    if none suffices."""
+    """Return the smallest tolerance at which at most `count` gaussians are selected;
+    `COARSEST` if even the coarsest cut has more."""
     if select(scene, camera, tolerance=COARSEST, device="cpu").num_gaussians > count:
         return COARSEST
     return select(scene, camera, budget=count, device="cpu").tolerance
 
 
 def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:
-    """Return the value from which on `fits` holds, on a logarithmic scale; it must hold
-    for `high`."""
+    """Return the smallest value for which `fits` holds, by bisection on a logarithmic
+    scale. `fits` must hold for `high` and for all values above the result."""
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if fits(middle) else (middle, high)
@@ -126,7 +130,7 @@ def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def like(values: Any, array: Any) -> Any:
-    """Return values as an array of the same kind, dtype and device as another."""
+    """Convert values to the library, dtype and device of `array`."""
     if isinstance(array, np.ndarray):
         return np.asarray(values, array.dtype)
     import torch
@@ -135,12 +139,13 @@ def like(values: Any, array: Any) -> Any:
 
 
 def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
-    """Return (N,) px: half the larger side of the box in which gsplat 1.5 draws each
-    gaussian; 0 for those it does not draw.
+    """Return the radii that gsplat 1.5 computes for gaussians, (N,) px.
 
-    gsplat's `radius_clip` omits gaussians whose radius is not larger. gsplat rounds
-    radii up first; unrounded radii allow any count, and a choice among gaussians of one
-    rounded size.
+    The radius is half the larger side of the box in which gsplat draws a gaussian, and
+    0 for a gaussian that it does not draw. gsplat's `radius_clip` omits gaussians whose
+    radius is at most that value. gsplat first rounds radii up to whole pixels. The
+    radii returned here are not rounded, so that a clip radius exists for any number of
+    gaussians.
     """
     library = _device.library_of(gaussians.means)
     viewmat = like(camera.viewmat, gaussians.means)
@@ -154,7 +159,7 @@ def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     axes = library.stack([library.stack(row, -1) for row in rows], -2)
-    # Covariance in view space: halves halvesᵀ.
+    # The covariance in view space is halves @ halvesᵀ.
     halves = world_to_view @ (axes * gaussians.scales[:, None, :])
     centers, variances = [], []
     for axis, size, focal, principal in (
@@ -179,5 +184,5 @@ def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
 
 
 def clip_radius_for(radii: Any, count: int) -> float:
-    """Return the smallest clip, in px, that leaves at most `count` gaussians."""
+    """Return the smallest clip radius, in px, that leaves at most `count` gaussians."""
     return _bisect(lambda clip: int((radii > clip).sum()) <= count, 1e-3, 1e5)

@@ -1,4 +1,4 @@
-"""The provenance in every recorded result: commit, machine, versions, command."""
+"""The provenance in every recorded result: commit, machine, versions and command."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _LIBRARIES = ("numpy", "torch", "gsplat", "flip-evaluator")
 
 
 def provenance(device: str = "cpu") -> dict[str, Any]:
-    """Return commit, command, processor, threads, instruction set, versions, and the
-    GPU if it is the device."""
+    """Return commit, command, processor, threads, instruction set and versions; also
+    the GPU if `device` is one."""
     names = []
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -41,7 +41,7 @@ def provenance(device: str = "cpu") -> dict[str, Any]:
 
 
 def _command() -> str:
-    """Return the command as it was typed, without folders."""
+    """Return the command line without folders."""
     words = [Path(word).name if os.sep in word else word for word in sys.argv]
     if words[0] == "__main__.py":
         words[0] = f"python -m {Path(sys.argv[0]).parent.name}"
@@ -49,8 +49,8 @@ def _command() -> str:
 
 
 def _commit() -> str:
-    """Return the commit of the checkout of this file, with "-dirty" if it was changed;
-    elsewhere the value of V3DG_COMMIT."""
+    """Return the commit of the checkout that contains this file, with "-dirty" if files
+    have changed. Outside a checkout, return the variable V3DG_COMMIT."""
     done = subprocess.run(
         ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"],
         capture_output=True,
@@ -68,8 +68,10 @@ def _version(library: str) -> str | None:
 
 
 def write(path: str | Path | None, result: dict[str, Any], device: str = "cpu") -> None:
-    """Write a result with its provenance as JSON, completely or not at all; nothing if
-    `path` is None."""
+    """Write a result with its provenance as JSON; do nothing if `path` is None.
+
+    An interrupted call leaves no partial file.
+    """
     if path is None:
         return
     path = Path(path)

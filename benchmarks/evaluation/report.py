@@ -1,5 +1,5 @@
-"""`python -m benchmarks report`: turns recorded results into a short page, a page of
-all tables, and plots."""
+"""The command `python -m benchmarks report`, which turns recorded results into a short
+page, a page with all tables, and plots."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from v3dg.cli._common import Flag
 
 @dataclass
 class Report:
-    """Make two pages with plots of what `evaluate` has recorded: what it comes to, and
-    all tables."""
+    """Make two pages with plots from results of `evaluate`: an overview, and all
+    tables."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders with results of `evaluate`; the first one is what the pages begin with.
-    """
+    """Folders with results of `evaluate`. If several folders have a part, the first one
+    counts."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("results.md")
-    """Page to write: an overview, and where we win and lose."""
+    """Overview page to write; it states where v3dg is better and where it is not."""
     tables: Annotated[Path, tyro.conf.arg(metavar="PATH")] = Path("evaluation.md")
     """Page to write with all tables and pictures."""
     no_plots: Flag = False
-    """Leave the plots in the folders as they are; drawing them needs matplotlib."""
+    """Do not draw plots, which needs matplotlib; plots that exist in the folders
+    remain."""
 
 
 BY_HAND = "<!-- written by hand from here on -->"
@@ -43,10 +44,10 @@ HOW = (
 
 
 def read_results(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return results by part, in the order of parts.
+    """Return results by part, in the order of the parts.
 
     Raises:
-        ValueError: There are no results.
+        ValueError: The folder has no results.
     """
     paths = {name: folder / f"{name}.json" for name in NAMES}
     results = {
@@ -56,20 +57,19 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
     }
     if not results:
         raise ValueError(
-            f"{folder}: expected results such as {NAMES[0]}.json; run `python -m benchmarks "
-            "evaluate` first"
+            f"{folder}: expected results such as {NAMES[0]}.json, got none; run `python -m "
+            "benchmarks evaluate` first"
         )
     return results
 
 
 def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
-    """Return the short page: a table, a picture, and a sentence per part.
+    """Return the overview page: a table, a picture, and sentences from the parts.
 
-    Pictures and the page of all tables are linked relative to the location of the page.
+    Links to pictures and to the page of tables are relative to the folder of `output`.
     """
     sections = [(folder, read_results(folder)) for folder in folders]
-    # Results of the first folder are used; those of others only for parts that it does
-    # not have.
+    # The first folder that has a part counts.
     measured = {
         name: (folder, r) for folder, results in reversed(sections) for name, r in results.items()
     }
@@ -102,7 +102,7 @@ def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
 
 
 def _overview(measured: dict[str, tuple[Path, dict[str, Any]]], output: Path) -> list[str]:
-    """Return the table and the picture at the beginning of the short page."""
+    """Return the table and the picture at the beginning of the overview page."""
     lines = []
     if "composed" in measured:
         _, result = measured["composed"]
@@ -127,8 +127,8 @@ def _overview(measured: dict[str, tuple[Path, dict[str, Any]]], output: Path) ->
 def _sentences(
     measured: dict[str, tuple[Path, dict[str, Any]]], home: str
 ) -> tuple[list[str], list[str]]:
-    """Return lists in Markdown of where we win and where we do not, in the order of
-    parts."""
+    """Return Markdown lists of where v3dg is better and where it is not, in the order
+    of the parts."""
     wins: list[str] = []
     losses: list[str] = []
     for name in [name for name in NAMES if name in measured]:
@@ -141,8 +141,8 @@ def _sentences(
 
 
 def tables_page(folders: Sequence[Path], output: Path) -> str:
-    """Return the page of all tables; pictures are linked relative to the location of
-    the page."""
+    """Return the page with all tables. Links to pictures are relative to the page's
+    folder."""
     lines = [
         "# The evaluation",
         "",
@@ -161,12 +161,13 @@ def tables_page(folders: Sequence[Path], output: Path) -> str:
 
 
 def place(result: dict[str, Any]) -> str:
-    """Return the device in a few words."""
+    """Return the name of the GPU, or the number of CPU threads."""
     return str(result.get("gpu") or f"{result['threads']} CPU threads")
 
 
 def machine(results: Sequence[dict[str, Any]]) -> str:
-    """Return device and versions of results from one machine, and all their commits."""
+    """Return the device and versions of results from one machine, and the commits of
+    all results."""
     first = results[0]
     where = first.get("gpu") or f"{first['threads']} threads of {first['processor']}"
     commits = list(dict.fromkeys(result["commit"] for result in results))
@@ -204,8 +205,8 @@ def draw_plots(folder: Path) -> None:
 
 
 def written_by_hand(page: Path) -> str:
-    """Return the part of a page from its marker on, including the marker; empty if
-    there is none."""
+    """Return the end of a page from the marker `BY_HAND` on, including the marker; an
+    empty string without a marker."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     _, marker, rest = text.partition(BY_HAND)
     return "\n" + marker + rest if marker else ""

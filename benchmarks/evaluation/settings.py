@@ -7,37 +7,37 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Settings:
-    """Sizes of an evaluation.
+    """The sizes that define the amount of work of an evaluation.
 
     Attributes:
-        asset_gaussians: Gaussians of the main scene's asset, unless one is given.
+        asset_gaussians: Gaussians of the main scene's asset, if it is generated.
         instances: Instances in the main scene.
-        worlds: Instances, and gaussians per asset, of the composed worlds besides the
-            main scene.
-        world_steps: Steps of the fit of their assets.
+        worlds: Instances, and gaussians per asset, of the other composed worlds.
+        world_steps: Steps of the fit of the assets of `worlds`.
         size: Width and height of pictures in px.
-        elevations: Elevations of the cameras of "composed", in degrees; other parts use
+        elevations: Elevations of the cameras of "composed" in degrees; other parts use
             the middle one.
-        directions: How many of the paper's four directions "composed" uses.
-        distances: Cameras per direction in "composed", and in "large".
-        sweep_distances: Cameras of the single sweep that the other parts use.
+        directions: Number of directions for "composed", of the paper's four.
+        distances: Number of cameras per direction in "composed", and in "large".
+        sweep_distances: Number of cameras in the sweep that the other parts use.
         judged_directions: Number of directions for which FLIP is computed, which takes
             a second per picture.
-        repeats: Number of timed calls, of which the median is used ...
-        composed_repeats: ... and in "composed", which has by far the most views.
-        steps: Steps of the fit, in "fit" and "levels"; the paper's \\*0 (nothing grown,
-            nothing fitted) is added.
+        repeats: Number of timed calls per picture; the median counts.
+        composed_repeats: Number of timed calls per picture in "composed", which has by
+            far the most views.
+        steps: Numbers of steps of the fit in "fit" and "levels". These parts also
+            measure the paper's \\*0, whose gaussians are neither grown nor fitted.
         tree_steps: Steps of the fit in "tree".
         large_copies: Copies of the asset in the large asset.
-        large_steps: Steps of its fit.
+        large_steps: Steps of the fit of the large asset.
         motion_frames: Frames of the zoom.
         hierarchy_instances: Instances in the scene that is compared with a hierarchy of
             single gaussians.
         hard_gaussians: Gaussians of each hard asset.
-        counts: Numbers of gaussians for which the operations are measured alone.
-        close_views: Number of sides from which an asset is seen from near ...
-        close_px: ... in pictures of this side.
-        panel: Side in px of the pictures that are saved.
+        counts: Numbers of gaussians for which single operations are measured.
+        close_views: Number of directions of the close views of an asset.
+        close_px: Width and height of the close views in px.
+        panel: Width and height in px of the saved pictures.
     """
 
     asset_gaussians: int

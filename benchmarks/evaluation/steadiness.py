@@ -1,12 +1,12 @@
-"""Measures how steady the pictures of a moving camera are: paths, and the changes
-between frames that should not occur.
+"""Steadiness of the pictures of a moving camera: camera paths, and changes between
+frames that the motion does not explain.
 
-The error of a frame minus the error of the frame before is what an eye sees besides the
-motion: flicker, and levels that are replaced at once. An average over the whole picture
-hides it, because pops are small; so the worst tile counts. For faster motion the
-difference is computed along the motion: the previous error is warped to the current
-picture by the depth. The pops alone are the difference of two pictures from the same
-position: with the cut of this frame, and with that of the frame before.
+The change of the error between consecutive frames is what an eye sees besides the
+motion: flicker, and levels that change at once. An average over the whole picture hides
+pops because they are small, so the worst tile counts. For faster motion, the difference
+is computed along the motion: the previous frame's error is warped to the current
+picture by the depth. To measure pops alone, two pictures from the same position are
+compared: one with the cut of this frame, and one with the cut of the previous frame.
 """
 
 from __future__ import annotations
@@ -28,19 +28,22 @@ from v3dg.select import Selection, select
 
 TILE_PX = 16
 SUPERSAMPLING = 4
-_DRIFT = 5e-4  # per frame, as a fraction of the distance: nothing else appears to move
+# Per frame, as a fraction of the distance; so slow that only pops appear to move.
+_DRIFT = 5e-4
 _ZOOM = 5e-3
 _TURN = 5e-4  # radians per frame
 _SHAKE = 2e-3  # to either side, as a fraction of the distance
-# Frames per period of the two waves of a shaking hand; they differ, so that the waves
-# do not coincide.
+# Frames per period of the two waves of a shaking hand. The periods differ, so that the
+# waves do not coincide.
 _WAVES = (7.3, 11.9)
-# For walking: vertical motion as a fraction of the distance, and frames per step.
+# A walking camera: its vertical motion as a fraction of the distance, and its frames
+# per step.
 _BOB, _STEP_FRAMES = 2e-3, 30.0
-_COVERED = 0.9  # alpha from which on a pixel has a depth
-_SAME_DEPTH = 0.02  # fraction of the depth; a pixel that differs more was hidden before
+_COVERED = 0.9  # minimum alpha of pixels whose depth is used
+# Fraction of the depth; a pixel whose depth differs more was hidden before.
+_SAME_DEPTH = 0.02
 
-# Options of `Renderer.render`, or a function that returns them for a frame.
+# Options of `Renderer.render`, or a function that returns the options for a frame.
 Options = dict[str, Any]
 Cut = Options | Callable[[Scene, Camera], Options]
 
@@ -51,7 +54,8 @@ class Path:
 
     Attributes:
         is_drift: Whether the motion is so slow that an eye notices pops.
-        moves: (F, 3) displacement of all instances from their initial positions.
+        moves: (F, 3) displacement of all instances from their initial positions, in
+            world units.
     """
 
     name: str
@@ -60,17 +64,18 @@ class Path:
     moves: Any
 
     def seen_from(self, k: int) -> Camera:
-        """Return the camera of a frame relative to instances that have not moved."""
+        """Return the camera of frame `k` relative to the initial positions of the
+        instances."""
         camera, shift = self.cameras[k], np.eye(4)
         shift[:3, 3] = self.moves[k]
         return replace(camera, viewmat=camera.viewmat @ shift)
 
 
 def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
-    """Return paths from a camera that sees the target, with this many frames each.
+    """Return paths of `frames` cameras each that start at `first`.
 
-    The target keeps its position in the picture, except where the camera rotates; it
-    need not be in the middle.
+    The target keeps its position in the picture, except on paths that rotate the
+    camera. It need not be in the middle of the picture.
     """
     away = first.position - target
     right, down = first.viewmat[0, :3], first.viewmat[1, :3]
@@ -120,14 +125,14 @@ def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
 
 
 def true_picture(subject: Any, camera: Camera, device: str, samples: int = SUPERSAMPLING) -> Any:
-    """Return (H, W, 3) floats in [0, 1] of all gaussians, with enough samples per side
-    that the picture hardly flickers."""
+    """Return the reference picture, (H, W, 3) floats in [0, 1]: all gaussians, with
+    enough samples per side of a pixel that the picture hardly flickers."""
     color = render(subject, camera.scaled(samples), tolerance=0.0, device=device).color
     return box_downsample(_device.to_host(color).clip(0, 1), samples)
 
 
 class Warp:
-    """Warps values of one picture to another picture, by the depths of both."""
+    """Warps values of one picture to another one, by the depths of both pictures."""
 
     def __init__(self, before: Camera, after: Camera, images: tuple[Any, Any]) -> None:
         (depth_before, alpha_before), (depth, alpha) = (
@@ -151,8 +156,8 @@ class Warp:
         self.is_valid &= np.abs(self(depth_before) - z) < _SAME_DEPTH * deep
 
     def __call__(self, values: Any) -> Any:
-        """Return (H, W, ...) values interpolated between the four nearest pixels;
-        unusable where they are not valid."""
+        """Return (H, W, ...) values, interpolated between the four nearest pixels.
+        Pixels where the warp is not valid have arbitrary values."""
         height, width = values.shape[:2]
         x, y = np.clip(self._x, 0, width - 1), np.clip(self._y, 0, height - 1)
         left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
@@ -165,7 +170,8 @@ class Warp:
 
 
 class Steadiness:
-    """Compares the frames of one path, one after another, with the true ones."""
+    """Compares the frames of one path with their reference pictures, one frame after
+    another."""
 
     def __init__(self) -> None:
         self._last: Any = None
@@ -175,8 +181,13 @@ class Steadiness:
         self._mse: list[float] = []
 
     def add(self, picture: Any, truth: Any, warp: Warp | None = None) -> None:
-        """Add the next frame, (H, W, 3) floats in [0, 1], and the warp from the last
-        frame."""
+        """Add the next frame.
+
+        Args:
+            picture: (H, W, 3) floats in [0, 1].
+            truth: The reference picture of the frame.
+            warp: The warp from the previous frame to this frame.
+        """
         error = _device.to_host(picture).clip(0, 1) - truth
         self._mse.append(float(np.square(error).mean()))
         if self._last is not None:
@@ -189,8 +200,8 @@ class Steadiness:
         self._last = error
 
     def row(self) -> Row:
-        """Return root mean squares in units of 1/255, of whole pictures and of the
-        worst tile of each; PSNR in dB."""
+        """Return the root mean squares of changes in units of 1/255, for whole pictures
+        and for each picture's worst tile; and PSNR in dB."""
         row = {
             "rms": round(float(np.mean(self._whole)), 4),
             "tile_mean": round(float(np.mean(self._worst_tile)), 4),
@@ -206,8 +217,8 @@ class Steadiness:
 
 
 def tile_means(values: Any) -> Any:
-    """Return means of (H, W) values over the tiles of a picture; tiles at its right and
-    bottom may be smaller."""
+    """Return means of (H, W) values over tiles of `TILE_PX`; tiles at the right and
+    lower borders may be smaller."""
     starts = [np.arange(0, side, TILE_PX) for side in values.shape]
     sums = np.add.reduceat(np.add.reduceat(values, starts[0], axis=0), starts[1], axis=1)
     height, width = (
@@ -217,14 +228,14 @@ def tile_means(values: Any) -> Any:
 
 
 def worst_tile(change: Any) -> float:
-    """Return the root mean square of the worst tile, in units of 1/255, of (H, W, 3)
-    differences of colours in [0, 1]."""
+    """Return the root mean square of the worst tile of (H, W, 3) colour differences, in
+    units of 1/255; colours are in [0, 1]."""
     return float(np.sqrt(tile_means(np.square(255.0 * change).mean(-1)).max()))
 
 
 def changed_items(before: Selection, after: Selection) -> int:
-    """Return the number of pairs that are drawn with another weight, appear or
-    disappear."""
+    """Return the number of (instance, cluster) pairs that appear, disappear or change
+    their weight."""
     if np.array_equal(before.instance_ids, after.instance_ids) and np.array_equal(
         before.cluster_ids, after.cluster_ids
     ):
@@ -238,7 +249,7 @@ def changed_items(before: Selection, after: Selection) -> int:
 
 
 class _Follower:
-    """The state of one way to draw a path."""
+    """The state of one of the compared ways to draw a path."""
 
     def __init__(self, cut: Cut, scene: Scene, device: str) -> None:
         self._cut, self._scene, self._device = cut, scene, device
@@ -266,10 +277,10 @@ class _Follower:
         self._last = items
 
     def _pop(self, camera: Camera, *cuts: Selection) -> float:
-        """Return the worst tile of the difference of two cuts from the same
+        """Return the error of the worst tile between pictures of two cuts from one
         position."""
-        # This does not use the renderer of the path, whose budget continues from its
-        # last frame.
+        # These pictures do not use the path's renderer, because their frames would
+        # change the state of its budget.
         pictures = (render(self._scene, camera, cut=cut, device=self._device).color for cut in cuts)
         before, after = map(_device.to_host, pictures)
         return worst_tile(after.clip(0, 1) - before.clip(0, 1))
@@ -296,13 +307,15 @@ def compare(
     along_motion: bool = True,
     samples: int = SUPERSAMPLING,
 ) -> list[Row]:
-    """Draw the frames of a path with several options of `render`; return steadiness,
-    and gaussians per frame.
+    """Draw the frames of a path with several options of `render`.
 
     Args:
-        along_motion: Whether errors are also warped along the motion, which draws all
+        along_motion: Whether to warp errors along the motion as well, which draws all
             gaussians once more.
-        samples: Samples per side of a pixel of the true pictures.
+        samples: Samples per side of a pixel of the reference pictures.
+
+    Returns:
+        A row for each of `cuts`: measures of steadiness, and gaussians per frame.
     """
     scene = copy.copy(Scene.of(subject))
     start = scene.positions

@@ -1,4 +1,4 @@
-"""The summary of a result in a sentence."""
+"""Sentences that summarise a result."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Summary:
-    """Sentences about where we win, by how much and at which error, and where we do
-    not."""
+    """Sentences about where v3dg is better, by how much and at which error; and about
+    where it is not."""
 
     wins: list[str] = field(default_factory=list)
     losses: list[str] = field(default_factory=list)

@@ -1,8 +1,9 @@
-"""Forward and backward on CUDA in comparison with gsplat, in one run: time, ratio,
-distance of the gradients.
+"""Time and gradients of a forward and backward pass on CUDA, in comparison with gsplat
+in one run.
 
-With fewer gaussians in a smaller picture, both are also compared with float64 on the
-CPU.
+The comparison uses the ratio of the times and the distance between the gradients. With
+fewer gaussians in a smaller picture, the gradients of v3dg and of gsplat are also
+compared with float64 gradients from the CPU.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Config:
     counts: tuple[int, ...] = (1_000_000,)
     sh_degree: int = 3
     filter_px2: float = 0.3
-    """As training uses it."""
+    """Variance of the filter in px²; 0.3 is the value that training uses."""
     width: int = 1920
     height: int = 1080
     repeats: int = 11
@@ -80,8 +81,8 @@ def compare(config: Config, count: int) -> dict[str, Any]:
 
 
 def errors_to_float64(config: Config, count: int) -> dict[str, dict[str, float]]:
-    """Return the relative L2 distance of the gradients of each row, ours and
-    gsplat's."""
+    """Return the relative L2 distance to float64 of the gradients of each input array,
+    for v3dg and for gsplat."""
     camera, gaussians, weights = inputs(config, count)
     exact = gradients_of(
         ours(config, camera),
@@ -98,8 +99,8 @@ def errors_to_float64(config: Config, count: int) -> dict[str, dict[str, float]]
 
 
 def inputs(config: Config, count: int) -> tuple[Camera, v3dg.Gaussians, tuple[Any, ...]]:
-    """Return a camera, gaussians, and random weights of colour and alpha; the weighted
-    sum is the loss."""
+    """Return a camera, gaussians, and random weights of colour and alpha. The loss is
+    the weighted sum."""
     camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=config.width, height=config.height)
     gaussians = like_trained(count, camera, gpu.DEVICE, sh_degree=config.sh_degree)
     generator = torch.Generator(gpu.DEVICE).manual_seed(1)
@@ -125,8 +126,12 @@ def gsplats(config: Config, camera: Camera, packed: bool) -> Draw:
 def measure(
     draw: Draw, gaussians: v3dg.Gaussians, weights: tuple[Any, ...], repeats: int
 ) -> tuple[float, float, dict[str, Any]]:
-    """Return milliseconds forward, and forward and backward, and the gradients of the
-    rows."""
+    """Measure one way to draw.
+
+    Returns:
+        Milliseconds of the forward pass, milliseconds of forward and backward, and the
+        gradients of the input arrays.
+    """
     leaves = with_gradients(gaussians)
     forward_ms = time_ms(lambda: draw(leaves), gpu.DEVICE, repeats).median
     total_ms = time_ms(lambda: gradients_of(draw, leaves, weights), gpu.DEVICE, repeats).median

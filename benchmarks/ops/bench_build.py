@@ -1,10 +1,10 @@
-"""Builds of bundles: seconds and GPU memory on each device, and the error of the
-resulting picture.
+"""Builds of bundles: seconds, GPU memory on each device, and the error of the pictures.
 
-Parts: "default" and "paper" build the asset with our settings and the paper's; "split"
-sorts the points of many copies of it, and "large" builds them as one asset. With a
-layout of instances and its true picture, the first two are also drawn at several
-numbers of gaussians in the frustum.
+The parts "default" and "paper" build the asset with the default settings and with the
+paper's. The part "split" sorts the points of many copies of the asset, and "large"
+builds the copies as one asset. If a layout of instances and a reference picture are
+given, the results of "default" and "paper" are also drawn, with several numbers of
+gaussians in the frustum.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from v3dg import _core, metrics
 from v3dg.bundle import Bundle
 from v3dg.levels import BuildConfig, build_bundle
 
-# px²; above it every instance is drawn from its last level.
+# px²; at this tolerance every instance is drawn from its coarsest level
 _MOST_TOLERANCE = 1e4
 
 Part = Literal["default", "paper", "split", "large"]
@@ -38,20 +38,22 @@ Part = Literal["default", "paper", "split", "large"]
 class Config:
     parts: tuple[Part, ...] = ("default", "paper", "split", "large")
     devices: tuple[str, ...] = ("cuda",)
-    """"cpu" too: patience for "large"."""
+    """Devices to build on, "cuda" and "cpu"; the part "large" takes very long on the
+    CPU."""
     asset: Path | None = None
-    """A .ply file; by default the procedural asset."""
+    """Trained asset, a .ply file; by default the generated asset."""
     copies: int = 285
-    """Copies of the asset in "split" and "large"; 285 donuts are 13 million
-    gaussians."""
+    """Copies of the asset in "split" and "large"; 285 copies of the paper's donut are
+    13 million gaussians."""
     layout: Path | None = None
-    """A layout of instances of that asset."""
+    """Layout of instances of that asset."""
     truth: Path | None = None
-    """The true picture of its camera."""
+    """Reference picture for the layout's camera `camera`."""
     camera: int = 59
     in_frustum: tuple[float, ...] = (2.9e6, 5.7e6, 11.5e6, 22.9e6)
-    """Numbers of gaussians to draw, as far as the bundle permits; the tolerance is
-    searched for."""
+    """Numbers of gaussians in the frustum at which the layout is drawn. A search finds
+    the tolerance for each number; a bundle's coarsest cut limits how few are
+    possible."""
     repeats: int = 3
     output: str | None = None
 
@@ -78,8 +80,11 @@ def main(config: Config) -> None:
 def build(
     asset: v3dg.Gaussians, settings: BuildConfig, device: str, repeats: int
 ) -> tuple[dict[str, Any], Bundle]:
-    """Return the median over the repeats; the first run of a process also loads the
-    kernels, so there is one more."""
+    """Build several times; return a row with the median time, and the bundle.
+
+    With several repeats, one more run comes first, because the first run of a process
+    also loads the kernels.
+    """
     seconds = []
     with gpu.PeakMemory() as peak:
         for _ in range(repeats + (repeats > 1)):
@@ -122,8 +127,8 @@ def split(means: Any, device: str, repeats: int) -> dict[str, Any]:
 
 
 def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
-    """Return FLIP and PSNR of the layout with this bundle, by the number of gaussians
-    in the frustum."""
+    """Return FLIP and PSNR of pictures of the layout with this bundle, for each number
+    of gaussians in the frustum."""
     if config.layout is None or config.truth is None:
         return []
     scene, cameras = read_layout(config.layout, bundle)
@@ -139,7 +144,7 @@ def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
         if wanted < least:
             continue
         low, high = math.log(1e-3), math.log(_MOST_TOLERANCE)
-        for _ in range(24):  # a lower tolerance has more gaussians
+        for _ in range(24):  # a lower tolerance selects more gaussians
             middle = (low + high) / 2
             if draw(math.exp(middle)).stats.gaussians_in_frustum > wanted:
                 low = middle

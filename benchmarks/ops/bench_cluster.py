@@ -1,5 +1,6 @@
-"""The speed of cutting assets into clusters, bounding them, halving them for a coarser
-level, and gathering them from instances."""
+"""The speed of operations on gaussians: splitting an asset into clusters, computing the
+bounds of clusters, halving gaussians for a coarser level, and gathering clusters from
+instances."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ class Config:
     num_gaussians: int = 1_000_000
     cluster_size: int = 256
     group_size: int = 397
-    """Number of gaussians in a group, which are halved together."""
+    """Number of gaussians in a group; the gaussians of a group are halved together."""
     sh_degree: int = 0
     instances: int = 4
     device: Literal["cpu", "cuda"] = "cpu"
@@ -32,7 +33,7 @@ class Config:
 
 
 def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
-    """Return gaussians on a bumpy shell, like a scanned object."""
+    """Return random gaussians on a bumpy sphere, similar to a scanned object."""
     rng = np.random.default_rng(seed)
     means = rng.standard_normal((num, 3), np.float32)
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -47,7 +48,7 @@ def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
 
 
 def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, Any]:
-    """Return every cluster, in each of some instances."""
+    """Return all clusters of an asset in several instances with random poses."""
     rng = np.random.default_rng(config.seed)
     count, sizes = config.instances, np.tile(np.diff(leaf_offset), config.instances)
     quaternions = rng.standard_normal((count, 4))
@@ -69,8 +70,12 @@ def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, Any]:
 def operations(
     gaussians: v3dg.Gaussians, config: Config
 ) -> dict[str, tuple[int, Callable[[], tuple[Any, ...]]]]:
-    """Return the operations by name: the number of input gaussians, and a call that
-    returns arrays."""
+    """Return the operations by name.
+
+    Returns:
+        For each operation: the number of input gaussians, and a function that runs the
+            operation and returns arrays.
+    """
     num = len(gaussians)
     ends, depth = np.array([0, num]), _core.num_halvings(num, config.cluster_size)
     order, leaf_offset = _core.median_split(gaussians.means, ends, depth)
@@ -109,14 +114,20 @@ def to_host(array: Any) -> Any:
 
 
 def check_against_cpu(config: Config) -> None:
-    """Check that both devices give the same bits."""
+    """Check that the device gives the same bits as the CPU.
+
+    Raises:
+        SystemExit: The results of an operation differ.
+    """
     small = random_gaussians(min(config.num_gaussians, 100_000), config.sh_degree, config.seed)
     on_cpu = operations(small, Config(**{**vars(config), "device": "cpu"}))
     on_device = operations(small.torch(config.device), config)
     for name, (_, run) in on_device.items():
         for got, expected in zip(run(), on_cpu[name][1](), strict=True):
             if not np.array_equal(to_host(got), to_host(expected)):
-                raise SystemExit(f"{name}: the two devices disagree")
+                raise SystemExit(
+                    f"{name}: expected the same bits on both devices, got different ones"
+                )
 
 
 def milliseconds(config: Config, run: Callable[[], object]) -> list[float]:
@@ -133,7 +144,7 @@ def milliseconds(config: Config, run: Callable[[], object]) -> list[float]:
         run()
         wait()
         times.append(1e3 * (time.perf_counter() - start))
-    return times[1:]  # the first one warms up
+    return times[1:]  # the first run is a warm-up
 
 
 def main(config: Config) -> None:

@@ -1,9 +1,10 @@
-"""The viewer with a mouse in Chromium on the same cores: milliseconds from a move to
-its answer.
+"""The response time of the viewer to mouse drags in Chromium: milliseconds from a mouse
+move to its answer.
 
-The answer is the browser's frame that shows the first picture of the new camera. The
-server is a separate process, `v3dg view`. Drags begin while the picture at rest is
-being refined, or has just arrived. Needs playwright, and Chromium in PATH.
+The answer is the browser's frame that shows the first picture of the new camera. Server
+and browser share the cores of one machine; the server is a separate process, `v3dg
+view`. Drags begin while the still picture is being refined, or just after it has
+arrived. The benchmark needs playwright, and Chromium in PATH.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"
 
 import chromium
 
-# Events on the page, with times of its own clock.
+# A script for the page that records events with the times of the page's clock.
 _NOTE = """() => {
     window.log = [];
     const show = viewer.picture.show.bind(viewer.picture);
@@ -44,15 +45,14 @@ _MOVES = 45
 class Config:
     scene: Path
     cameras: tuple[int, ...] = (3, 10, 19, 59)
-    """Indices, in the file, of the cameras to drag from."""
+    """Indices of the cameras in the file from which drags begin."""
     drags: int = 8
-    """Drags per camera."""
+    """Number of drags per camera."""
     webgl: bool = False
-    """Whether Chromium composes the page with WebGL in software; otherwise without
-    WebGL.
-    """
+    """Whether Chromium composes the page with WebGL in software; by default it uses no
+    WebGL."""
     output: str | None = None
-    """JSON file for the result."""
+    """JSON file for the results."""
 
 
 def main(config: Config) -> None:
@@ -94,8 +94,12 @@ def main(config: Config) -> None:
 
 
 def drags_from(page: Any, camera: int, drags: int) -> dict[str, Any]:
-    """Return the times of answers to drags from a camera of the file, gaps between
-    later pictures, and widths of the first ones."""
+    """Drag from a camera of the file.
+
+    Returns:
+        Milliseconds of the answers to drags, gaps between later pictures, and widths of
+        the first pictures.
+    """
     page.evaluate(f"viewer.fileCameras.lookThrough({camera})")
     page.wait_for_timeout(2500)
     answers, gaps, widths = [], [], []

@@ -1,8 +1,9 @@
-"""Our CUDA frame in comparison with gsplat's, in one run: time, ratio, and the
-difference of the pictures.
+"""Frames of v3dg on CUDA in comparison with gsplat in one run: times, their ratio, and
+the difference of the pictures.
 
-Scenes: a layout of instances in full detail (gsplat gets all of them in the world),
-random gaussians of the sizes of training, and one asset that fills the picture.
+The scenes are a layout of instances at full detail (gsplat gets all gaussians in world
+space), random gaussians with the sizes of trained ones, and one asset that fills the
+picture.
 """
 
 from __future__ import annotations
@@ -29,18 +30,19 @@ from v3dg.render import Renderer
 @dataclass
 class Config:
     asset: Path | None = None
-    """A .ply file; by default the procedural asset."""
+    """Trained asset, a .ply file; by default the generated asset."""
     layout: Path | None = None
-    """A layout of instances of that asset; without one, that part is left out."""
+    """Layout of instances of that asset; by default no layout is measured."""
     cameras: tuple[int, ...] = (45, 50, 55, 59)
-    """Indices of the layout's cameras."""
+    """Indices of cameras of the layout."""
     counts: tuple[int, ...] = (1_000_000, 4_000_000, 20_000_000)
-    """Number of random gaussians."""
+    """Numbers of random gaussians."""
     width: int = 1920
     height: int = 1080
     repeats: int = 11
     gsplat: bool = True
-    """Also measure gsplat, packed and not; the faster one counts."""
+    """Whether gsplat is measured, in its packed and unpacked modes; the faster one
+    counts."""
     output: str | None = None
 
 
@@ -69,7 +71,7 @@ def main(config: Config) -> None:
 
     asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     if config.layout is not None:
-        # The bundle has a single level, because only that is drawn.
+        # The bundle has only one level, because no other level is drawn.
         bundle = build_bundle(
             asset, config=BuildConfig(min_clusters=1 << 30), progress=False, device="cpu"
         )

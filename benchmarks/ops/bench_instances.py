@@ -1,9 +1,9 @@
-"""Scenes of many instances on a GPU: frames in comparison with gsplat, error, memory,
-movement, budgets.
+"""Scenes of many instances on a GPU: frames in comparison with gsplat, errors, memory,
+moving instances and budgets.
 
-Two parts: a layout of instances of one asset, with a range of its cameras, and fields
-of very many visible instances. The error of fields is measured on crops, because
-nothing can draw all of their gaussians.
+There are two parts: a layout of instances of one asset, seen by a range of its cameras;
+and fields of very many visible instances. The error of fields is measured on crops,
+because nothing can draw all gaussians of a field in one picture.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from v3dg.render import Renderer
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-# An instance of a field can be smaller than a pixel, and its gaussians are not
-# filtered.
+# Reference crops of fields need many samples per pixel: an instance may be smaller than
+# a pixel, and the gaussians of level 0 have no filter.
 _CROP_SUPERSAMPLING = 16
 _STEP = 0.005
 
@@ -44,28 +44,29 @@ _STEP = 0.005
 @dataclass
 class Config:
     asset: Path | None = None
-    """A .ply file; by default the procedural asset."""
+    """Trained asset, a .ply file; by default the generated asset."""
     layout: Path | None = None
-    """A layout of instances of that asset; without one, that part is left out."""
+    """Layout of instances of that asset; by default no layout is measured."""
     cameras: tuple[int, int] = (40, 60)
-    """First camera of the layout, and the one after the last."""
+    """Range of the layout's cameras: the index of the first one, and the index after
+    the last one."""
     tolerances: tuple[float, ...] = (DEFAULT_TOLERANCE, 9.0, 9.4)
     budget: int = 3_000_000
     fields: tuple[int, ...] = (100_000, 2_000_000)
     """Numbers of instances of the fields."""
     crops: int = 4
-    """Number of crops of a field, each of 64 x 36 px, on which it is compared with all
-    of its gaussians."""
+    """Number of crops of a field, each of 64 x 36 px, that are compared with all
+    gaussians."""
     repeats: int = 11
     refine: int = 0
-    """Numbers of steps of refinements, which are also measured."""
+    """Numbers of steps of refinements to measure; 0 for none."""
     gsplat: bool = True
     output: str | None = None
 
 
 def main(config: Config) -> None:
     asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
-    with gpu.PeakMemory():  # measures an idle process
+    with gpu.PeakMemory():  # records the memory of an idle process
         torch.zeros(1, device=gpu.DEVICE)
     bundle = build_bundle(asset, progress=False, device=gpu.DEVICE)
     result: dict[str, Any] = {"repeats": config.repeats, "refine": config.refine}
@@ -82,7 +83,8 @@ def main(config: Config) -> None:
 
 
 def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge) -> Row:
-    # Everything that is timed comes before pictures are judged, which uses every core.
+    # All times are measured before pictures are compared, because the comparison uses
+    # all cores.
     runs = [frames(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
     runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
     moving = movement(scene, cameras[-1], config)
@@ -130,8 +132,12 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
 def frames(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Row, list[Picture]]:
-    """Return the frames of every camera, near to far, with one renderer, as in a flight
-    through the scene."""
+    """Draw every camera with one renderer, from near to far, as in a flight through the
+    scene.
+
+    Returns:
+        A row of measurements, and the pictures.
+    """
     ms, device_ms, select_ms, counts = [], [], [], []
     renderer, gigabytes = drawn_before(scene, cameras, options, repeats)
     for camera in cameras:
@@ -146,7 +152,7 @@ def frames(
         device_ms.append(statistics.median(s.select_ms + s.draw_ms for s in stats))
         select_ms.append(statistics.median(s.select_ms for s in stats))
         counts.append(stats[-1].gaussians_in_frustum)
-    # Pictures come last, because their memory besides the frame's is not the
+    # The pictures are drawn last, so that their memory does not count as the
     # renderer's.
     pictures = [to_8bit(renderer.render(camera, **options).color) for camera in cameras]
     row = {
@@ -166,8 +172,8 @@ def frames(
 def drawn_before(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Renderer, float]:
-    """Return a renderer that has drawn every camera, and its peak memory; no frame is
-    timed afterwards."""
+    """Return a renderer that has drawn every camera, and its peak memory in gigabytes.
+    No frame here is timed."""
     with gpu.PeakMemory() as peak:
         renderer = Renderer(scene, device=gpu.DEVICE)
         for camera in cameras:
@@ -177,8 +183,8 @@ def drawn_before(
 
 
 def gigabytes_alone(bundle: v3dg.Bundle, config: Config) -> list[float]:
-    """Return, for each tolerance, the memory of a process that draws the layout and has
-    built nothing."""
+    """Return the memory in gigabytes of a process that only draws the layout, for each
+    tolerance. The process builds nothing, because it reads the bundle from a file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "levels.v3dg"
         bundle.write(path)
@@ -187,7 +193,7 @@ def gigabytes_alone(bundle: v3dg.Bundle, config: Config) -> list[float]:
 
 
 def _drawing_gigabytes(path: Path, config: Config, tolerance: float) -> float:
-    torch.zeros(1, device=gpu.DEVICE)  # as in an idle process
+    torch.zeros(1, device=gpu.DEVICE)  # loads what an idle process has loaded
     assert config.layout is not None
     scene, cameras = read_layout(config.layout, v3dg.Bundle.open(path))
     chosen = list(cameras.values())[slice(*config.cameras)]
@@ -195,14 +201,14 @@ def _drawing_gigabytes(path: Path, config: Config, tolerance: float) -> float:
 
 
 def flight(scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int) -> Row:
-    """Return frames in which each camera moves sideways, by 0.5 % per frame of its
-    distance to the middle of the scene."""
+    """Return a row for frames in which each camera moves sideways. A step is 0.5 % of
+    the distance between the camera and the middle of the scene."""
     renderer, middle = Renderer(scene, device=gpu.DEVICE), scene.positions.mean(axis=0)
     ms = []
     for camera in cameras:
         step = _STEP * float(np.linalg.norm(camera.position - middle))
-        # Cameras are made before: a frame is measured from the call to the finished
-        # picture.
+        # The cameras are made in advance, because only the time from the call to the
+        # finished picture counts.
         views = iter([_aside(camera, step * k) for k in range(3 + repeats)])
 
         def frame(views: Iterator[Camera] = views) -> None:
@@ -219,8 +225,8 @@ def _aside(camera: Camera, distance: float) -> Camera:
 
 
 def movement(scene: Scene, camera: Camera, config: Config) -> Row:
-    """Return the cost of giving every instance another position and rotation in every
-    frame."""
+    """Return a row with the cost of new positions and rotations of all instances in
+    every frame."""
     renderer = Renderer(scene, device=gpu.DEVICE)
     tolerance = config.tolerances[-1]
     host = tuple(np.array(a) for a in (scene.positions, scene.quaternions, scene.scales))
@@ -260,7 +266,8 @@ def gsplat(
 
 
 def field(bundle: v3dg.Bundle, count: int, config: Config, judge: Judge) -> Row:
-    """Return instances with random rotations and sizes on a square, all visible."""
+    """Return a row for a square field of instances with random rotations and sizes, all
+    of which are visible."""
     rng = np.random.default_rng(0)
     side = math.isqrt(count - 1) + 1
     means = bundle.level_gaussians(0).means

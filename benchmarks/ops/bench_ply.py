@@ -1,4 +1,4 @@
-"""The speed and memory use of reading and writing .ply files."""
+"""The speed and the memory use of reading and writing .ply files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
 
 
 def peak_growth(run: Callable[[], object]) -> int:
-    """Return the peak growth of the process in bytes while `run` runs (Linux)."""
+    """Return the peak growth of the process's memory in bytes while `run` runs (Linux
+    only)."""
 
     def status(key: str) -> int:
         lines = Path("/proc/self/status").read_text().splitlines()
@@ -57,7 +58,7 @@ def seconds(repeats: int, run: Callable[[], object]) -> list[float]:
         start = time.perf_counter()
         run()
         times.append(time.perf_counter() - start)
-    return times[1:]  # the first one warms up
+    return times[1:]  # the first run is a warm-up
 
 
 def main(config: Config) -> None:
@@ -85,7 +86,7 @@ def main(config: Config) -> None:
         if not np.array_equal(back.sh, gaussians.sh) or not np.array_equal(
             back.means, gaussians.means
         ):
-            raise SystemExit("what was read is not what was written")
+            raise SystemExit("ply: expected the gaussians that were written, got different ones")
         del back
         for name, run in (
             ("write", lambda: v3dg.write_asset(path, gaussians)),

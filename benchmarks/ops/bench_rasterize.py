@@ -1,5 +1,5 @@
-"""One asset that fills the picture: frames per second, stages of a frame, and the error
-against double precision."""
+"""One asset that fills the picture: frames per second, times of the stages of a frame,
+and the error against double precision."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from v3dg.cameras import Camera
 @dataclass
 class Config:
     asset: Path | None = None
-    """A .ply file; by default the procedural asset."""
+    """Trained asset, a .ply file; by default the generated asset."""
     size: int = 800
     repeats: int = 20
     output: str | None = None
 
 
 def camera_that_fills(gaussians: v3dg.Gaussians, width: int, height: int) -> Camera:
-    """Return a camera that looks at the asset from the front and above, so that it
-    fills a picture."""
+    """Return a camera that looks at the asset from the front and above, at the distance
+    where the asset fills the picture."""
     low, high = np.quantile(gaussians.means, [0.01, 0.99], axis=0)
     center, extent = (low + high) / 2, np.linalg.norm(high - low)
     eye = center + extent * np.array([0.0, -0.42, 0.7])

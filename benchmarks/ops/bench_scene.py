@@ -1,8 +1,8 @@
-"""A layout of many instances of a bundle: gaussians, time and error of a frame, for
-several tolerances.
+"""A layout of many instances of a bundle: number of gaussians, time and error of a
+frame, for several tolerances.
 
-The true picture is given by its path, or is the full asset drawn at twice the size and
-box-averaged.
+Pictures are compared with the picture `truth` or, without one, with the full asset
+drawn at twice the size and averaged over 2 x 2 pixels.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Config:
     bundle: Path
     layout: Path
     camera: int = 59
-    """Index of the layout's camera."""
+    """Index of the camera in the layout."""
     tolerances: tuple[float, ...] = (8.0, 4.4, 3.0, 2.0)
     truth: Path | None = None
     repeats: int = 3
     pictures: Path | None = None
-    """Folder for the pictures."""
+    """Folder for the pictures; by default they are not saved."""
     output: str | None = None
-    """JSON file for the result."""
+    """JSON file for the results."""
     tags: dict[str, str] = field(default_factory=dict)
 
 

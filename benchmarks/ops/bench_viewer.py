@@ -1,9 +1,9 @@
-"""The viewer with a mouse: milliseconds from a camera's move to the picture that
-answers it.
+"""The response time of the viewer to mouse drags: milliseconds from a move of the
+camera to the picture that answers it.
 
-A client in Python speaks the browser's protocol over a local socket, so everything but
-the browser's own work is measured. Each drag orbits the scene, and begins while the
-picture at rest is being refined.
+A client in Python speaks the protocol of the viewer's page over a local socket, so
+everything except the browser's own work is measured. Each drag orbits the scene, and
+begins while the still picture is being refined.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ MOVES_A_SECOND = 60
 class Config:
     scene: Path
     cameras: tuple[int, ...] = (3, 10, 19, 59)
-    """Indices, in the file, of the cameras to drag from."""
+    """Indices of the cameras in the file from which drags begin."""
     drags: int = 8
-    """Drags per camera."""
+    """Number of drags per camera."""
     seconds: float = 1.5
-    """Length of a drag."""
+    """Duration of a drag in seconds."""
     size: tuple[int, int] = (1600, 900)
-    """Size of the browser's window, px."""
+    """Width and height of the browser's window in px."""
     device: str = "cpu"
     output: str | None = None
-    """JSON file for the result."""
+    """JSON file for the results."""
 
 
 def main(config: Config) -> None:
@@ -70,13 +70,14 @@ def main(config: Config) -> None:
 def drag_around(
     browser: Tab, view: View, target: np.ndarray, config: Config, rng: np.random.Generator
 ) -> dict:
-    """Return the times of answers to drags around the target."""
+    """Drag around the target; return the times of answers, gaps between pictures, and
+    widths of the first pictures."""
     eye, angle = np.array(view.position), 0.0
     answers, gaps, widths = [], [], []
     browser.look(view, config.size)
     settle(browser, config.size)
     for _ in range(config.drags):
-        # The drag interrupts the refinement of this picture.
+        # The drag interrupts the refinement of the picture of this view.
         browser.look(turned(eye, target, angle, view), config.size)
         until = time.perf_counter() + rng.uniform(0.3, 1.5)
         browser.pictures(until)
@@ -87,7 +88,7 @@ def drag_around(
             browser.look(turned(eye, target, angle, view), config.size)
             for at, picture in browser.pictures(begin + (move + 1) / MOVES_A_SECOND):
                 if picture.width > 0.8 * config.size[0] and not answered:
-                    continue  # in progress when the drag began
+                    continue  # this picture was in progress when the drag began
                 (gaps if answered else answers).append(1e3 * (at - (last if answered else begin)))
                 answered, last = True, at
                 widths.append(picture.width)
@@ -109,8 +110,8 @@ def summary(values: list[float]) -> dict[str, float]:
 
 
 def turned(eye: np.ndarray, target: np.ndarray, angle: float, view: View) -> View:
-    """Return the view from the eye, rotated about the vertical line through the
-    target."""
+    """Return the view after rotating its position by an angle about the vertical line
+    through the target."""
     x, y, z = eye - target
     c, s = math.cos(angle), math.sin(angle)
     moved = target + np.array([c * x - s * y, s * x + c * y, z])

@@ -1,9 +1,9 @@
-"""The resources of a build of a given size, computed from its plan: nothing is built,
-and no time is measured.
+"""The resources that a build of a given size needs, computed from its plan. Nothing is
+built, and no time is measured.
 
-Sizes are in bytes. `disk` is the peak on disk; `read` and `written` are totals, without
-what a continued build reads again. `host` excludes the interpreter and its libraries,
-about 0.1 GB.
+Sizes are in bytes. `disk` is the peak use of the disk. `read` and `written` are totals,
+without data that a resumed build reads again. `host` excludes the interpreter and its
+libraries, which take about 0.1 GB.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from v3dg.levels.whole import UNIT_LEAVES
 @dataclass
 class Config:
     millions: tuple[float, ...] = (1, 10, 100, 1000)
-    """Numbers of gaussians of the builds."""
+    """Numbers of gaussians of the builds, in millions."""
     sh_degree: tuple[int, ...] = (0, 3)
     memory: str = "8GiB"
-    """Host memory that each build may use."""
+    """Limit of the host memory of each build."""
 
 
 def main(options: Config) -> None:
@@ -42,7 +42,8 @@ def main(options: Config) -> None:
 
 
 def needs(num_gaussians: int, sh_degree: int, memory: str) -> dict[str, Any]:
-    """Return counts and bytes of a build, as JSON values."""
+    """Return the numbers of gaussians, clusters and so on of a build, and the bytes
+    that it needs, as JSON values."""
     config = BuildConfig()
     plan = Plan.of(num_gaussians, config)
     units = plan.units(UNIT_LEAVES)
@@ -58,7 +59,8 @@ def needs(num_gaussians: int, sh_degree: int, memory: str) -> dict[str, Any]:
     pages = int(np.diff(file.run(0, num_pages).places).sum())
     input_bytes, a_unit = num_gaussians * gaussian, unit_bytes(num_gaussians, sh_degree)
     sizes = _Sizes.of(in_bytes(memory), a_unit, sh_degree, [_Tile("", num_gaussians, sh_degree, 0)])
-    is_sorted = num_gaussians > sizes.in_memory  # on the disk
+    # Whether the gaussians are sorted on disk.
+    is_sorted = num_gaussians > sizes.in_memory
     passes = _core.num_halvings(num_gaussians, sizes.in_node)
     return {
         "gaussians": num_gaussians,
@@ -94,7 +96,8 @@ def arrays_of(level: LevelPlan) -> list[Any]:
 
 
 def record_bytes(num_clusters: int, num_groups: int) -> int:
-    """Return the size of a level's record: boxes, two balls and the error."""
+    """Return the bytes that a build records for a level: the box of each cluster, and
+    two balls and the error of each group."""
     return 24 * num_clusters + 40 * num_groups
 
 

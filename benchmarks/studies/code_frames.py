@@ -1,12 +1,14 @@
-"""Frames drawn from codes in comparison with frames from float32 rows, on a GPU;
-docs/notes/experiments/2026-11-22-codecs-drawing.md has results.
+"""Frames drawn from quantised codes in comparison with frames drawn from float32 rows,
+on a GPU.
 
     python -m benchmarks.studies.code_frames donut.ply donutsea.json NAME=OTHER.ply
 
-For the scene, and for each asset alone: bytes on the GPU per stored gaussian; frame
-times in alternation (of the device and of the wall clock); times of the project stage;
-whether pictures from codes have the bits of pictures of a float32 bundle with the
-decoded rows; and their difference to those of the original bundle.
+For the scene and for each asset alone, the study measures bytes on the GPU per stored
+gaussian; frame times of the device and of the wall clock, with the kinds of bundles in
+alternation; and times of the project stage. It also checks whether pictures from codes
+have the same bits as pictures of a float32 bundle with the decoded rows, and measures
+their difference from pictures of the original bundle.
+docs/notes/experiments/2026-11-22-codecs-drawing.md has results.
 """
 
 from __future__ import annotations
@@ -34,12 +36,12 @@ class Config:
     asset: tyro.conf.Positional[Path]
     layout: tyro.conf.Positional[Path]
     more: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Further assets, each as NAME=FILE."""
+    """More assets, each as NAME=FILE."""
     rounds: int = 30
-    """Number of frames of each kind in each view."""
+    """Number of frames of each bundle in each view."""
     decodes_once: bool = False
-    """Whether small bundles are decoded once, as renderers do; otherwise all are drawn
-    from codes."""
+    """Whether small bundles are decoded once, as renderers do by default; otherwise
+    every bundle is drawn from codes."""
 
 
 def memory():
@@ -49,8 +51,8 @@ def memory():
 
 
 def kinds_of(gaussians):
-    """Return the float32 bundle as built, its codes, and a float32 bundle of the
-    decoded codes."""
+    """Return three bundles by name: float32 as built, its quantised codes, and the
+    decoded codes as float32."""
     built = v3dg.build_bundle(gaussians, device=DEVICE, progress=False)
     codes = Bundle(built.clusters, built.groups, built.gaussians, codec="quantized")
     rows = Bundle(codes.clusters, codes.groups, codes.gaussians)
@@ -62,7 +64,8 @@ def bytes_of(bundle):
     torch.cuda.empty_cache()
     before = memory()
     model, table = residency.model(bundle, _device.resolve(DEVICE)), residency.table(bundle)
-    placed = residency.scene(bundle, _device.resolve(DEVICE))  # this puts the tables there
+    # Places the tables on the device.
+    placed = residency.scene(bundle, _device.resolve(DEVICE))
     resident = model.bytes + table.bytes_on(0)
     done = {
         "bytes": resident,
@@ -147,7 +150,7 @@ def compared(subjects, cameras, options, rounds):
 
 def views_of(gaussians):
     """Return cameras around an asset, at distances of 1, 2.5 and 8 radii of the ball
-    with 9 of 10 gaussians."""
+    that contains 90 % of its gaussians."""
     means = np.asarray(gaussians.means, np.float64)
     centre = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.9))

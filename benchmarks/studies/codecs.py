@@ -1,14 +1,13 @@
-"""The cost of a bundle's codec in bytes and in pictures.
-
-docs/notes/experiments/2026-11-22-codecs-error-and-size.md has results.
+"""The cost of the codecs of bundles in bytes and in picture quality.
 
     python -m benchmarks.studies.codecs --up 0 -1 0 --assets angel.sog st-peter.sog
 
-Each asset, or the part of it that is nearest to its middle, is built with each codec.
-Pictures of bundles are drawn at the default tolerance from four sides at four
-distances. `psnr` compares the float32 bundle with its own conversion: the codec's error
-alone. `flip` compares 8-bit pictures with the whole asset, drawn with several samples
-per pixel: for the bundle built with each codec, and for the converted one.
+Each asset, or its part that is nearest to its middle, is built with each codec.
+Pictures are drawn at the default tolerance from four sides at four distances. `psnr`
+compares the float32 bundle with its own conversion to the codec, so it is the error of
+the codec alone. `flip` compares 8-bit pictures with pictures of the whole asset with
+several samples per pixel, for the bundle built with each codec and for the converted
+bundle. docs/notes/experiments/2026-11-22-codecs-error-and-size.md has results.
 """
 
 from __future__ import annotations
@@ -28,7 +27,8 @@ from v3dg.bundle.codec import CODECS
 from v3dg.metrics import box_downsample, flip, psnr
 from v3dg.pictures import to_8bit
 
-DISTANCES = (1.0, 2.5, 8.0, 25.0)  # of the camera, in radii of the ball with 9 of 10 gaussians
+# Of the camera, in radii of the ball with 90 % of the gaussians.
+DISTANCES = (1.0, 2.5, 8.0, 25.0)
 WIDTH, HEIGHT = 480, 360
 
 
@@ -37,15 +37,16 @@ class Config:
     assets: tuple[Path, ...]
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     most: int = 100_000
-    """Largest number of gaussians taken from an asset."""
+    """Maximum number of gaussians to use of an asset."""
     steps: int = 600
-    """Maximum number of steps of the fits."""
+    """Maximum number of steps of a fit."""
     samples: int = 3
-    """Samples per side of a pixel of the true pictures."""
+    """Samples per side of a pixel of the reference pictures."""
 
 
 def part_of(asset: v3dg.Gaussians, most: int) -> v3dg.Gaussians:
-    """Return the gaussians nearest to the median position, in their order."""
+    """Return the gaussians nearest to the median position, in the order of the
+    asset."""
     if len(asset) <= most:
         return asset
     distance = np.linalg.norm(asset.means - np.median(asset.means, axis=0), axis=1)
@@ -55,8 +56,8 @@ def part_of(asset: v3dg.Gaussians, most: int) -> v3dg.Gaussians:
 def cameras_of(
     asset: v3dg.Gaussians, up: Sequence[float], distance: float, samples: int = 1
 ) -> list[v3dg.Camera]:
-    """Return four cameras around the asset, for pictures that are `samples` times
-    larger."""
+    """Return four cameras around the asset, whose pictures are larger by a factor of
+    `samples`."""
     centre = np.median(asset.means, axis=0).astype(np.float64)
     radius = np.quantile(np.linalg.norm(asset.means - centre, axis=1), 0.9)
     axis = np.asarray(up) / np.linalg.norm(up)
@@ -76,7 +77,7 @@ def pictures(subject: Any, cameras: Sequence[v3dg.Camera]) -> list[Any]:
 
 
 def mean_psnr(references: Sequence[Any], tests: Sequence[Any]) -> float:
-    """Return the PSNR of the mean squared error over all pictures."""
+    """Return the PSNR of the squared error averaged over all pictures."""
     errors = [10 ** (-psnr(a, b) / 10) for a, b in zip(references, tests, strict=True)]
     return round(-10 * float(np.log10(np.mean(errors))), 2)
 

@@ -1,7 +1,7 @@
-"""Counts the paths from a leaf to a root on which not exactly one cluster is selected.
-There must be none.
+"""Checks that each path from a leaf to a root has exactly one selected cluster, by
+counting the paths on which this is false.
 
-tests/support/exact_cut.py defines a trial and how it is counted.
+tests/support/exact_cut.py defines a trial and how paths are counted.
 """
 
 from __future__ import annotations
@@ -22,14 +22,23 @@ def main(arguments=None):
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--trials", type=int, default=10_000_000)
-    parser.add_argument("--bundle", type=Path, help="a .v3dg file; random trees if not given")
+    parser.add_argument(
+        "--bundle", type=Path, help=(".v3dg file to select from; by default random trees")
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--partial", action="store_true", help="of random pages, closed towards the root"
+        "--partial",
+        action="store_true",
+        help=(
+            "select only from a random set of loaded pages, in which the pages above a page are "
+            "loaded, too"
+        ),
     )
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument(
-        "--fades", action="store_true", help="weights of random fades have to add up to 1"
+        "--fades",
+        action="store_true",
+        help=("fade between levels, and check that the weights on a path add up to 1"),
     )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args(arguments)

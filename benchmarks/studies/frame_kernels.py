@@ -1,16 +1,17 @@
-"""The time of each kernel of a frame on a GPU, with the time of the frame and a digest
-of its picture.
+"""The time of each kernel of a frame on a GPU, the time of the frame, and a digest of
+its picture.
 
-    python -m benchmarks.studies.frame_kernels --layout donutsea.json --asset donut.ply
-    \\
-        --captured ASSETS --names Fungi -o frame_kernels_h200
+    python -m benchmarks.studies.frame_kernels \\
+        --layout donutsea.json --asset donut.ply --captured ASSETS --names Fungi \\
+        -o frame_kernels_h200
 
-ASSETS is a folder as for `pairs`. Captured assets are drawn completely, and with levels
-at the default tolerance; random gaussians completely; instances of a layout with levels
-at two tolerances, and completely. A frame is measured from idle device to idle device,
-Python included, as the median of 25; kernel times are means over a dozen frames under
-torch's profiler. To compare two versions, run it with each in alternation on one
-machine: equal digests show that they draw the same bits.
+ASSETS is a folder as for `pairs`. Captured assets are drawn at full detail, and with
+levels at the default tolerance. Random gaussians are drawn at full detail. Instances of
+a layout are drawn with levels at two tolerances, and at full detail. The time of a
+frame is the median of 25, from idle device to idle device with Python's overhead. Times
+of kernels are means over a dozen frames under torch's profiler. To compare two
+versions, run the study with each version in alternation on one machine; equal digests
+show that both versions draw the same bits.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ from v3dg.cameras import Camera
 
 Row = dict[str, Any]
 Frame = tuple[str, Any, Camera, float | None]
-"""Name, renderer, camera, and tolerance, or None if there are no levels."""
+"""Name, renderer, camera, and tolerance; the tolerance is None for a subject without
+levels."""
 
 _WARM_UPS, _FRAMES, _PROFILED = 4, 25, 12
 _TOLERANCES = 9.4, 3.0
@@ -45,21 +47,22 @@ _TOLERANCES = 9.4, 3.0
 @dataclass
 class Config:
     asset: Path | None = None
-    """A .ply file; by default the procedural asset."""
+    """Trained asset, a .ply file; by default the generated asset."""
     layout: Path | None = None
-    """A layout of instances of that asset; without one, that part is left out."""
+    """Layout of instances of that asset; by default no layout is measured."""
     cameras: tuple[int, ...] = (40, 45, 50, 55, 59)
-    """Indices of the layout's cameras."""
+    """Indices of cameras of the layout."""
     captured: Path | None = None
-    """A folder with assets.json; without one, that part is left out."""
+    """Folder with assets.json; by default no captured asset is measured."""
     names: tuple[str, ...] = ()
     """Names of assets in that folder."""
     counts: tuple[int, ...] = (1_000_000, 4_000_000)
-    """Number of random gaussians."""
+    """Numbers of random gaussians."""
     widths: tuple[int, ...] = (1920, 3840)
-    """Width in px; pictures of captured assets and random gaussians are 16 : 9."""
+    """Widths of pictures in px. Pictures of captured assets and of random gaussians
+    have an aspect ratio of 16:9."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File of the results."""
+    """File for the results."""
 
 
 def frames(config: Config) -> Iterator[Frame]:
@@ -113,7 +116,8 @@ def _sized(
 
 
 def measure(frame: Frame) -> Row:
-    """Return milliseconds of the frame and of its kernels, and its statistics."""
+    """Measure a frame; return the milliseconds of the frame and of each of its kernels,
+    and its statistics."""
     import torch
     from torch.profiler import ProfilerActivity, profile
 
@@ -144,7 +148,7 @@ def measure(frame: Frame) -> Row:
 
 
 def _short(name: str) -> str:
-    """Return a kernel's name without its namespaces and arguments."""
+    """Return the name of a kernel without namespaces and arguments."""
     found = re.findall(r"(\w+)(?:<|\(|$)", name.replace("(anonymous namespace)::", ""))
     return found[0].removesuffix("_kernel") if found else name
 

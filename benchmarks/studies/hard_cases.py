@@ -1,12 +1,13 @@
-"""The errors of float32 against float64 in tests/support/hard_cases.py: histograms, and
-the table of docs/numerics.md.
+"""The errors of float32 against float64 in the cases of tests/support/hard_cases.py:
+histograms, and the table of docs/numerics.md.
 
-    python -m benchmarks.studies.hard_cases --device cpu --output
-    benchmarks/results/hard_cases_cpu.json python -m benchmarks.studies.hard_cases
-    --device cuda --output benchmarks/results/hard_cases_h200.json python -m
-    benchmarks.studies.hard_cases --docs # write the table again, from those two
+    python -m benchmarks.studies.hard_cases --device cpu \\
+        --output benchmarks/results/hard_cases_cpu.json
+    python -m benchmarks.studies.hard_cases --device cuda \\
+        --output benchmarks/results/hard_cases_h200.json
+    python -m benchmarks.studies.hard_cases --docs
 
-The last command measures nothing.
+The last command writes the table again from the two results, without measuring.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
 sys.path.insert(0, str(ROOT / "tests" / "support"))
 
-import hard_cases as cases  # noqa: E402  (of the tests)
+import hard_cases as cases  # noqa: E402  (a module of the tests)
 
 DECADES = (1e-7, 1e-6, 1e-5, 1e-4)
 DOCS = ROOT / "docs" / "numerics.md"
@@ -40,21 +41,24 @@ class Config:
     device: Literal["cpu", "cuda"] = "cpu"
     output: str | None = None
     docs: bool = False
-    """Write docs/numerics.md's table from the recorded results, without measuring."""
+    """Write the table of docs/numerics.md from the recorded results, without
+    measuring."""
 
 
 def histogram(errors: np.ndarray) -> dict[str, Any]:
-    """Return the percentages of errors up to each decade and beyond the last, and the
-    largest error."""
+    """Return the percentages of errors up to each decade and beyond the last one, and
+    the largest error."""
     counts = np.bincount(np.searchsorted(DECADES, errors.ravel()), minlength=len(DECADES) + 1)
     shares = 100 * counts / max(errors.size, 1)
     return {"percent": shares.round(2).tolist(), "largest": float(f"{errors.max(initial=0.0):.1e}")}
 
 
 def gradient_histogram(case: cases.HardCase, device: str) -> dict[str, Any]:
-    """Return a histogram of the errors of the drawn gaussians' gradients. Gradients are
-    by relative changes of the inputs, and errors are in units of the root mean square
-    gradient of each input."""
+    """Return a histogram of the errors of the gradients of drawn gaussians.
+
+    Gradients are derivatives by relative changes of the inputs. Errors are relative to
+    the root mean square gradient of each input.
+    """
     import torch
 
     single = cases.gradients(case, cases.draw_core, torch.float32, device)
@@ -76,8 +80,8 @@ def measure(case: cases.HardCase, device: str) -> dict[str, Any]:
 
 
 def text_of(shares: list[float]) -> str:
-    """Return whole percentages; a dot stands for a value that rounds to zero but is not
-    zero."""
+    """Return percentages without decimals, separated by spaces. A dot stands for a
+    value above zero that rounds to zero."""
     return " ".join(f"{s:.0f}" if s >= 0.5 else "." if s > 0 else "0" for s in shares)
 
 

@@ -1,8 +1,8 @@
 """The cost of large builds: many copies of an asset as one asset, built by `v3dg build`
 in separate processes.
 
-It measures the time including reading and writing, and the peak memory of the host and
-of the GPU, for each number of gaussians and memory limit. Copies are in a grid, and
+For each number of gaussians and memory limit, the study measures the time with reading
+and writing, and the peak memory of the host and of the GPU. The copies form a grid, and
 their gaussians are displaced slightly, so that no two copies are equal.
 """
 
@@ -29,11 +29,11 @@ from benchmarks.evaluation import record
 @dataclass
 class Config:
     asset: Path
-    """A .ply file of SH degree 0."""
+    """Asset of SH degree 0, a .ply file."""
     millions: tuple[float, ...] = (1, 10, 100)
-    """Numbers of gaussians of the builds."""
+    """Numbers of gaussians of the builds, in millions."""
     memory: tuple[str, ...] = ("2GiB", "2GiB", "7GiB")
-    """Host memory that each build may use."""
+    """Limits of the host memory, one for each build."""
     device: str = "cuda"
     output: str | None = None
 
@@ -65,8 +65,8 @@ def main(config: Config) -> None:
 
 
 def write_copies(path: Path, base: v3dg.Gaussians, at_least: int) -> int:
-    """Write copies of an asset, one after the other, as a .ply file; return the number
-    of gaussians."""
+    """Write copies of an asset one after the other as a .ply file, until there are at
+    least `at_least` gaussians; return the number of gaussians."""
     copies = -(-at_least // len(base))
     side = int(np.ceil(np.sqrt(copies)))
     rng = np.random.default_rng(5)
@@ -88,8 +88,8 @@ def write_copies(path: Path, base: v3dg.Gaussians, at_least: int) -> int:
 
 
 def watched(command: list[str]) -> dict[str, Any]:
-    """Run a command; return its seconds, and its peak memory in GB on the host and on
-    the first GPU."""
+    """Run a command; return its seconds, and the peak memory in GB of its process on
+    the host and of the first GPU."""
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     most = {"host_gb": 0.0, "gpu_gb": 0.0}
@@ -105,15 +105,18 @@ def watched(command: list[str]) -> dict[str, Any]:
     watcher = threading.Thread(target=watch)
     watcher.start()
     if process.wait() != 0:
-        raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
+        raise SystemExit(
+            f"{' '.join(command)}: failed with exit code {process.returncode}; its messages are "
+            "above"
+        )
     seconds = time.perf_counter() - start
     watcher.join()
     return {"seconds": round(seconds, 2), **most}
 
 
 def gpu_gigabytes() -> float:
-    """Return the memory in use on the first GPU by all processes; 0 if there is
-    none."""
+    """Return the memory in GB that all processes together use on the first GPU; 0
+    without a GPU."""
     query = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "-i", "0"]
     try:
         done = subprocess.run(query, capture_output=True, text=True, check=True, env=os.environ)

@@ -1,12 +1,13 @@
-"""Would a metric based on measured error be better than footprint per gaussian?
+"""Would a metric that is based on measured errors be better than the footprint per
+gaussian?
 
-Each group of a bundle is drawn alone, at several sizes, together with its clusters one
-level finer and its leaves (4 x 4 samples). The gain per gaussian of one level more
-detail, at the size at which each group appears, then determines a cut: the pruning of
-the tree with the least sum of error and lambda x gaussians (Chou, Lookabaugh and Gray
-1989). This cut is compared with the metric at equal numbers of gaussians, from outside
-of an object; docs/notes/experiments/2026-11-22-selection-measured-error.md has the
-table.
+Each group of a bundle is drawn alone at several sizes, together with its clusters one
+level finer and with its leaves (4 x 4 samples per pixel). This gives the gain per
+gaussian of one more level of detail, for each size of the group. These gains determine
+a cut: the pruning of the tree with the smallest sum of error and lambda x gaussians
+(Chou, Lookabaugh and Gray 1989). The cut is compared with the cut of the existing
+metric at equal numbers of gaussians, from outside of an object.
+docs/notes/experiments/2026-11-22-selection-measured-error.md has the results.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from benchmarks.evaluation import record
 from v3dg import _core, metrics
 
 SIZES = {0.5: 4, 1.0: 4, 2.0: 2, 4.0: 2, 8.0: 1}
-"""Sizes of groups relative to the native size, measured along a side; and samples per
-side of a pixel for the leaves."""
-_MOST_SAMPLES = 12_000_000  # per picture
-# Weights of |colour| and |alpha|, as in the fit.
+"""Sizes of groups, as multiples of the native length of a side; and for each size the
+samples per side of a pixel for the leaves."""
+_MOST_SAMPLES = 12_000_000  # samples per picture
+# Weights of |colour| and |alpha|, the same as in the fit.
 _WEIGHTS = np.array([1, 1, 1, 1.5], np.float32) / 3
 _FOV = 0.3
 
@@ -36,15 +37,15 @@ _FOV = 0.3
 class Config:
     bundle: Path
     views: int = 4
-    """Number of views of each group."""
+    """Number of directions from which each group is drawn."""
     widths: tuple[int, ...] = (700, 350, 176, 90)
-    """Size of the object, px."""
+    """Widths of the object in px."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     output: str | None = None
 
 
 class Groups:
-    """The data about the groups of a bundle: their gaussians, smallest balls, and
+    """The groups of a bundle: ranges of their gaussians, smallest enclosing balls, and
     gains."""
 
     def __init__(self, bundle: v3dg.Bundle) -> None:
@@ -72,8 +73,8 @@ class Groups:
         self.all = bundle.gaussians
 
     def _runs(self, links: Any, clusters: Any, offset: Any) -> Any:
-        """Return (G, 2) first and end of the gaussians of the clusters that are linked
-        to each group."""
+        """Return (G, 2) the start and end of the gaussians of the clusters that `links`
+        assigns to each group."""
         runs = np.tile(np.array([1 << 60, 0]), (len(self.table), 1))
         linked = clusters[links >= 0]
         np.minimum.at(runs[:, 0], links[linked], offset[linked])
@@ -81,8 +82,8 @@ class Groups:
         return runs
 
     def measure(self, num_views: int) -> None:
-        """Compute the gain (G, S), error per gaussian, and the cover (G,), px of alpha
-        at twice the size."""
+        """Compute the gain (G, S) of more detail, an error per additional gaussian; and
+        the cover (G,), the sum of alpha over the pixels at twice the native size."""
         self.gain, self.cover = np.zeros((len(self.table), len(SIZES))), np.zeros(len(self.table))
         rng = np.random.default_rng(1)
         turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(num_views)]
@@ -104,8 +105,12 @@ class Groups:
     def _compare(
         self, groups: Any, level: int, turn: Any, radius_px: float, cell: int, samples: int
     ) -> Any:
-        """Return the gain of one more level in one view of groups side by side, and
-        alpha, in px each."""
+        """Draw groups side by side, each in a cell of the picture.
+
+        Returns:
+            For each group, summed over its pixels: the decrease of the error by one
+                more level of detail, and alpha.
+        """
         across = math.ceil(math.sqrt(len(groups)))
         spacing = cell / radius_px
         depth = 12 * across * spacing + 20
@@ -139,8 +144,8 @@ class Groups:
         return errors[0] - errors[1], sums(truth[..., 3])
 
     def see(self, cameras: list[v3dg.Camera]) -> None:
-        """Compute how much of each group is visible among all, from these cameras:
-        (G,), 1 if nothing hides it."""
+        """Compute `visibility`, the fraction of each group that other groups do not
+        hide from these cameras, (G,)."""
         import torch
 
         asset = self.bundle.level_gaussians(0).torch("cpu")
@@ -157,13 +162,13 @@ class Groups:
         self.visibility = seen / alone
 
     def _size(self, camera: v3dg.Camera) -> Any:
-        """Return (G,) the size of each group relative to the native size, measured
-        along a side."""
+        """Return (G,) the size of each group on screen, as a multiple of the native
+        length of a side."""
         distance = np.linalg.norm(self.ball[:, :3] - camera.position, axis=1)
         return camera.fx * self.ball[:, 3] / distance / np.sqrt(2 * self.count / math.pi)
 
     def cut(self, rule: str, camera: v3dg.Camera, tolerance: float) -> Any:
-        """Return the clusters that a rule chooses."""
+        """Return the indices of the clusters that a rule selects."""
         if rule in ("old", "visible"):
             weight = self.table.weight.astype(float)
             if rule == "visible":
@@ -186,14 +191,14 @@ class Groups:
 
     def _to_parents(self, join: Any, values: Any) -> Any:
         values = values.copy()
-        for group in np.flatnonzero(self.table.parent >= 0):  # by level
+        for group in np.flatnonzero(self.table.parent >= 0):  # in the order of levels
             parent = self.table.parent[group]
             values[parent] = join(values[parent], values[group])
         return values
 
     def _gain_at(self, camera: v3dg.Camera) -> Any:
-        """Return (G,) the gain at the apparent size: interpolated in logarithms,
-        extrapolated like the area."""
+        """Return (G,) the gain at the size on screen. Gains are interpolated in
+        logarithms; beyond the largest measured size they grow with the area."""
         size, known = np.log2(self._size(camera)), np.log2(list(SIZES))
         inside = np.clip(size, known[0], known[-1])
         step = np.minimum((inside - known[0]).astype(int), len(known) - 2)
@@ -238,7 +243,8 @@ def main(config: Config) -> None:
 
 
 def _mean_flip(groups: Groups, rule: str, cameras: Any, truths: Any, target: float) -> float:
-    """Return the mean FLIP of the cuts with the most gaussians up to a limit."""
+    """Return the mean FLIP of a rule's cuts that have at most `target` gaussians, as
+    many as possible."""
     sizes = np.diff(groups.bundle.clusters.offset)
     scene = v3dg.Scene.of(groups.bundle)
     flips = []

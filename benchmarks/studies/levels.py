@@ -1,9 +1,9 @@
-"""The effect of each setting of the build: one change at a time, drawn in a layout of
-many instances.
+"""The effect of each setting of the build: one setting at a time is changed, and the
+results are drawn in a layout of many instances.
 
-It makes the table of docs/notes/experiments/2026-11-22-levels-each-setting.md:
-gaussians in the frustum, FLIP and PSNR against a given picture at three tolerances, and
-the processor seconds of the build.
+The study measures gaussians in the frustum, FLIP and PSNR against a given picture at
+three tolerances, and the CPU seconds of the build.
+docs/notes/experiments/2026-11-22-levels-each-setting.md has the table.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Config:
     camera: int = 59
     tolerances: tuple[float, ...] = (8.0, 4.4, 3.0)
     only: tuple[str, ...] = ()
-    """Names of changes; all by default."""
+    """Names of the changes to measure; by default all."""
     output: str | None = None
 
 

@@ -1,5 +1,5 @@
-"""How even are the frames of a moving flight? Percentiles over 5,000 frames, and how
-many were drawn twice."""
+"""How even are the frame times of a flight? Percentiles over 5,000 frames, and the
+number of frames that were drawn twice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.evaluation.assets import read_layout
 from benchmarks.evaluation.record import write
 from v3dg import Bundle, Camera, Renderer, Scene
 
-# Frames of a new renderer, whose buffers are still too small; they are reported
+# The first frames of a new renderer, whose buffers are still growing, are reported
 # separately.
 _FIRST_FRAMES = 50
 _NUM_WORST = 10
@@ -30,23 +30,26 @@ def main(arguments: list[str] | None = None) -> int:
         "--bundle", type=Path, required=True, help=".v3dg file of the layout's asset"
     )
     parser.add_argument(
-        "--layout", type=Path, required=True, help="scene file of instances and cameras"
+        "--layout", type=Path, required=True, help="scene file with instances and cameras"
     )
     parser.add_argument(
         "--cameras",
         type=int,
         nargs=2,
         default=(40, 60),
-        help="whose distances the flight goes through",
+        help="range of the layout's cameras, whose distances the flight covers",
     )
     parser.add_argument("--frames", type=int, default=5000)
     parser.add_argument("--tolerances", type=float, nargs="+", default=[3.0, 9.4])
     parser.add_argument("--fade", type=float, default=1.02)
     parser.add_argument(
-        "--memory", nargs="+", default=["none"], help='sizes of pools; "none": all resident'
+        "--memory",
+        nargs="+",
+        default=["none"],
+        help=('sizes of page pools, such as 2GB; "none" keeps everything resident'),
     )
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--json", type=Path, help="write the result there")
+    parser.add_argument("--json", type=Path, help="JSON file for the results")
     options = parser.parse_args(arguments)
 
     scene, cameras = read_layout(options.layout, Bundle.open(options.bundle))
@@ -65,8 +68,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def flight(scene: Scene, cameras: list[Camera], count: int) -> list[Camera]:
-    """Return two turns around the middle of the scene, from the farthest of the cameras
-    to the nearest and back."""
+    """Return cameras that circle the middle of the scene twice, from the distance of
+    the farthest camera to that of the nearest camera and back."""
     middle = scene.positions.mean(axis=0)
     offsets = np.array([camera.position - middle for camera in cameras])
     distances = np.linalg.norm(offsets, axis=1)
@@ -101,8 +104,8 @@ def flight(scene: Scene, cameras: list[Camera], count: int) -> list[Camera]:
 
 
 def measure(renderer: Renderer, views: list[Camera], options: dict[str, float]) -> dict[str, Any]:
-    """Return milliseconds from the call to the finished picture, and how often frames
-    were drawn again."""
+    """Draw the views; return the milliseconds from the call to the finished picture,
+    and the number of frames that were drawn again."""
     milliseconds = np.empty(len(views))
     draws = np.empty(len(views), np.int64)
     bytes_in = np.empty(len(views), np.int64)

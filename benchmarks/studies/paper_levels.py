@@ -1,12 +1,14 @@
-"""Levels of the paper's settings, and of the paper's published code, beside each other.
+"""Levels built by v3dg with the paper's settings, in comparison with levels built by
+the paper's published code.
 
     python -m benchmarks.studies.paper_levels ASSET LAYOUT --truth PICTURE \\
         --published FOLDER... -o paper_levels_cpu
 
-Every instance of the layout shows the same level, which a camera of the layout looks
-at. The picture is compared with the truth for that camera. FOLDER holds the
-`clusters.npz` and the `gaussians.npz` that the published code writes. It runs on a CPU
-where its import of `gsplat` finds `v3dg.compat.gsplat`.
+All instances of the layout are drawn from the same level, seen by a camera of the
+layout. The picture is compared with the reference picture of that camera. Each FOLDER
+holds the files `clusters.npz` and `gaussians.npz` that the published code writes. The
+published code runs on a CPU if its import of `gsplat` is replaced by
+`v3dg.compat.gsplat`.
 """
 
 from __future__ import annotations
@@ -34,21 +36,22 @@ _SH_CONSTANT = 0.28209479177387814  # Y_00
 @dataclass
 class Config:
     asset: tyro.conf.Positional[Path]
-    """The donut of the paper."""
+    """The paper's donut, an asset."""
     layout: tyro.conf.Positional[Path]
-    """Its layout DonutSea."""
+    """The paper's layout DonutSea."""
     truth: Path
-    """PNG of the supersampled picture."""
+    """Supersampled reference picture, a PNG."""
     published: tuple[Path, ...] = ()
-    """Folders of bundles of the published code."""
+    """Folders with bundles of the published code."""
     camera: int = 59
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File of the results, without its suffix."""
+    """File for the results, without suffix."""
     device: str = "auto"
 
 
 def published_levels(folder: Path) -> Iterator[tuple[int, v3dg.Gaussians]]:
-    """Yield the levels of a bundle of the published code, with their numbers."""
+    """Yield the number and the gaussians of each level of a bundle of the published
+    code."""
     clusters = np.load(folder / "clusters.npz")
     gaussians = np.load(folder / "gaussians.npz")
     start = clusters["start_indices"].ravel()
@@ -71,8 +74,7 @@ def published_levels(folder: Path) -> Iterator[tuple[int, v3dg.Gaussians]]:
 
 
 def everywhere(config: Config, level: v3dg.Gaussians) -> RenderedImage:
-    """Return the camera's picture of the layout if every instance shows these
-    gaussians."""
+    """Draw the layout with these gaussians in every instance."""
     bundle = v3dg.build_bundle(level, config=BuildConfig.leaves_only(), progress=False)
     names = {config.asset.name: bundle}
     scene, cameras = v3dg.read_scene(config.layout, bundles=names)

@@ -1,10 +1,11 @@
-"""Axes, counts and largest errors of a figure that goes through every pair of formats.
+"""Axes, counts and largest errors of a figure after a conversion through each pair of
+formats.
 
     python -m benchmarks.studies.round_trips
 
-The figure has another length along each axis and another colour from each side, so
-that no turn, mirroring or mistake in its harmonics is missed. It prints the tables of
-docs/formats.md.
+The figure has a different length along each axis and a different colour from each side,
+so that the errors show any rotation, reflection or mistake in the harmonics. The study
+prints the tables of docs/formats.md.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ class Errors(NamedTuple):
     Attributes:
         position: Error of a coordinate, relative to the height of the figure.
         shape: Error of a covariance, relative to the largest variance of its gaussian.
-        color: Error of a colour of degree 0, where 1 is from black to white.
-        harmonics: Error of a coefficient of higher degrees.
+        color: Error of a colour of degree 0; 1 is the difference between black and
+            white.
+        harmonics: Error of an SH coefficient above degree 0.
     """
 
     position: float
@@ -46,7 +48,7 @@ class Errors(NamedTuple):
 
 
 def make_figure() -> Gaussians:
-    """Make a post with a foot, a long arm to the right and a short one forward; -y is
+    """Return a post with a foot, a long arm to the right and a short arm forward; -y is
     up."""
     rng = np.random.default_rng(0)
     along = np.linspace(0, 1, _COUNT // 4)
@@ -58,7 +60,7 @@ def make_figure() -> Gaussians:
     means = np.concatenate([post, right_arm, front_arm, foot]) + rng.normal(0, 0.02, (_COUNT, 3))
     quats = rng.normal(size=(_COUNT, 4))
     sh = rng.uniform(-0.6, 0.6, (_COUNT, (_DEGREE + 1) ** 2, 3))
-    # Red from the right, green from above, blue from the front.
+    # The figure is red from the right, green from above, and blue from the front.
     sh[:, 1:4] = (
         0.1 * sh[:, 1:4]
         + np.diag([0.0, 0.5, 0.0])
@@ -74,7 +76,8 @@ def make_figure() -> Gaussians:
 
 
 def write(path: Path, figure: Gaussians) -> None:
-    """Write a figure of which -y is up, also in formats that only others write."""
+    """Write a figure whose up axis is -y, also in formats that v3dg does not write
+    otherwise."""
     if path.name == "lod-meta.json":
         config = v3dg.BuildConfig(steps=0)
         bundle = v3dg.build_bundle(figure, config=config, progress=False, device="cpu")
@@ -87,7 +90,7 @@ def write(path: Path, figure: Gaussians) -> None:
 
 
 def _splat(figure: Gaussians) -> bytes:
-    """Return the records of a `.splat`, which has no harmonics."""
+    """Return the bytes of a `.splat` file, which has no harmonics."""
     color = figure.sh[:, 0] * _core.sh_base0 + 0.5
     rgba = np.concatenate([color, figure.opacities[:, None]], axis=1)
     columns = [
@@ -100,7 +103,7 @@ def _splat(figure: Gaussians) -> bytes:
 
 
 def place_of(folder: Path, ending: str) -> Path:
-    """Return a path for a file of a format in a folder of its own."""
+    """Return a path for a file of a format, in a separate folder."""
     own = folder / ending.strip(".").replace(".", "_")
     own.mkdir(exist_ok=True)
     if ending.startswith("."):
@@ -109,7 +112,8 @@ def place_of(folder: Path, ending: str) -> Path:
 
 
 def errors_of(found: Gaussians, figure: Gaussians) -> Errors:
-    """Return the largest errors, between gaussians that are nearest to each other."""
+    """Return the largest errors between each gaussian of the figure and the nearest
+    gaussian that was read."""
     distances = np.square(figure.means[:, None].astype(np.float64) - found.means).sum(axis=2)
     nearest = distances.argmin(axis=1)
     same = found.subset(nearest)
@@ -128,7 +132,7 @@ def errors_of(found: Gaussians, figure: Gaussians) -> Errors:
 
 def _covariances(gaussians: Gaussians) -> npt.NDArray[np.float64]:
     """Return the covariances (N, 3, 3) of gaussians, which do not depend on the order
-    and the signs of a gaussian's axes."""
+    and signs of their axes."""
     half = rotation_from_quaternion(normalised(gaussians.quats)) * gaussians.scales[:, None]
     return np.asarray(half @ half.transpose(0, 2, 1))
 
@@ -166,8 +170,8 @@ def main() -> None:
 
 
 def _text(errors: Errors) -> str:
-    """Return errors as text with one digit each; errors below 1e-6, the rounding of
-    float32, become 0."""
+    """Return the errors as text with one digit each. Errors below 1e-6, which rounding
+    to float32 causes, become 0."""
     return ", ".join(map(_digit, errors))
 
 

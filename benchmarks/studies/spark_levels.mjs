@@ -1,8 +1,10 @@
-// What Spark's quality tree leaves of an asset at several counts, as .ply files for part "merging" of the evaluation:
+// Writes the levels of Spark's quality tree at several numbers of gaussians, as .ply files for the part "merging" of
+// the evaluation:
 //   npm install @sparkjsdev/spark@2.2.0 && node spark_levels.mjs donut.ply peers 50 25 12.5 6.25 1
-// Spark's worker and its compiled tree run in Node as they are, without a browser. It chooses nodes for a camera that
-// is far away, so that all of the asset counts alike. Merged nodes may have opacities above 1, which Spark draws with
-// a falloff of its own: here they are clamped. Prints seconds.json, with the seconds of the one build for each.
+// Spark's worker and its compiled tree run unchanged in Node, without a browser. The tree selects nodes for a camera
+// that is very far away, so that all parts of the asset count equally. Merged nodes may have opacities above 1, for
+// which Spark has a special falloff; here they are clamped. The script prints seconds.json, in which each level has
+// the seconds of the single build.
 import fs from "node:fs";
 import path from "node:path";
 import vm from "node:vm";
@@ -11,7 +13,7 @@ const [asset, folder, ...percents] = process.argv.slice(2);
 const entry = path.join(process.cwd(), "node_modules/@sparkjsdev/spark/dist/spark.module.js");
 const source = fs.readFileSync(entry, "utf8");
 
-// The worker's program is a string constant of the module, the compiled part its first WebAssembly in base64.
+// The worker's program is a string constant in the module. The compiled part is its first WebAssembly, in base64.
 const worker = vm.runInThisContext(source.match(/const jsContent = ('(?:[^'\\]|\\.)*')/s)[1]);
 const wasm = Buffer.from(source.match(/"(AGFzbQ[A-Za-z0-9+/=]*)"/)[1], "base64");
 const waiting = new Map();
@@ -26,7 +28,7 @@ Object.assign(globalThis, {
     else if (message.result !== undefined) resolve?.(message.result);
   },
 });
-console.log = console.error; // the worker reports there; standard output is for the result
+console.log = console.error; // the worker logs its progress; standard output is for the result
 vm.runInThisContext(worker);
 
 let calls = 0;
@@ -37,7 +39,7 @@ function call(name, args) {
   return answer;
 }
 
-// A function of the module by its name, and what it needs; none of them is exported.
+// Returns the source of a function of the module, because the module does not export it.
 function take(name) {
   const start = source.indexOf(`function ${name}(`);
   let end = source.indexOf("{", start), depth = 0;
@@ -68,7 +70,7 @@ for (let i = 0; i < lodSplats.numSplats; ++i)
     high[k] = Math.max(high[k], positions[4 * i + k]);
   }
 const away = 20 * Math.hypot(...high.map((x, k) => x - low[k]));
-const eye = low.map((x, k) => (x + high[k]) / 2 + (k === 2 ? away : 0)); // looks down its own -z
+const eye = low.map((x, k) => (x + high[k]) / 2 + (k === 2 ? away : 0)); // the camera looks along -z
 const { lodId } = await call("initLodTree", { numSplats: lodSplats.numSplats, lodTree: lodSplats.extra.lodTree });
 
 const names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];

@@ -1,11 +1,11 @@
-"""What makes motion steadier besides a fade? A budget in steps, hysteresis, pages that
-fade in, other ramps.
+"""What makes motion steadier, besides a fade? A budget whose tolerance changes in
+steps, hysteresis, pages that fade in, and other ramps of the fade.
 
-A budget in steps is compared with the tolerance of each view alone, also in frames
-after the camera has stopped where steps are farthest behind. Hysteresis is an
-experiment: cuts with a state, computed from the metrics of selection. So are pages that
-fade in, in addition to what a pool does, and ramps, which have no state.
-docs/notes/experiments/index.md lists the results.
+A budget in steps is compared with the tolerance that each view needs by itself, also in
+frames after the camera has stopped where the steps are farthest behind. The other
+trials are experiments. Hysteresis uses cuts with a state, which are computed from the
+metrics of the selection. Pages that fade in are simulated in addition to what a pool
+does. Ramps have no state. docs/notes/experiments/index.md lists the results.
 """
 
 from __future__ import annotations
@@ -37,43 +37,45 @@ from v3dg.residency import residency
 from v3dg.select import rule_of
 
 # Hysteresis starts at this multiple of the distance, so that its state has settled at
-# the first frame.
+# the first frame of the path.
 _FAR = 1.15
 _FAR_FRAMES = 30
-_SWAY = 12  # frames in one direction
-_ARRIVAL_FRAMES = 8  # as in csrc/residency/page_table.h
-_HEADROOM_PARTS = 32  # as in csrc/select/budget_math.h
+_SWAY = 12  # number of frames in one direction
+_ARRIVAL_FRAMES = 8  # the constant in csrc/residency/page_table.h
+_HEADROOM_PARTS = 32  # the constant in csrc/select/budget_math.h
 
 
 @dataclass
 class Config:
     bundles: tuple[str, ...]
-    """.v3dg files, each as PATH or PATH:UP (-y, z)."""
+    """.v3dg files, each as PATH or PATH:UP, where UP is an axis such as -y or z."""
     frames: int = 48
     size: int = 160
     side: int = 1
-    """Side of a field of copies; 1: a single one."""
+    """Number of copies per side of a square field; 1 for a single copy."""
     distances: tuple[float, ...] = (3.0,)
     tolerance: float = DEFAULT_TOLERANCE
-    """The budget is the count at this tolerance in the middle of the path."""
+    """Tolerance of the cuts. The budget is the number of gaussians at this tolerance in
+    the middle of the path."""
     fade: float = DEFAULT_FADE
     hysteresis: tuple[float, ...] = (1.05, 1.1)
     arrivals: tuple[int, ...] = (1, 4, 8)
-    """Numbers of frames over which pages fade in."""
+    """Numbers of frames in which a page fades in."""
     rests: tuple[int, ...] = (1, 4, 16, 64)
-    """Numbers of frames in which the tolerance of a budget arrives at rest."""
+    """Numbers of frames in which the tolerance of a budget reaches its final value
+    after the camera stops."""
     bands: tuple[float, ...] = (1.005, 1.01, 1.03, 1.05)
-    """Further fades with linear ramps; smooth ones have these and half as much
-    again."""
+    """More fades with linear ramps. Smooth ramps are drawn with these widths and with
+    widths larger by half."""
     trials: tuple[str, ...] = ("budget", "rest", "hysteresis", "pages", "ramps")
     paths: tuple[str, ...] = ()
-    """Run only these."""
+    """Names of the paths to measure; by default all."""
     device: str = "cpu"
     json: Path | None = None
 
 
 class AtOnce:
-    """The least tolerance of a budget, regardless of the frame before."""
+    """The smallest tolerance for a budget, regardless of previous frames."""
 
     def __init__(self, budget: int, fade: float) -> None:
         self.budget, self.fade = budget, fade
@@ -84,10 +86,10 @@ class AtOnce:
 
 
 class Rests:
-    """A budget in steps along a path and, after its end, over some frames to its final
-    value.
+    """A budget in steps along a path. After the path's end, the tolerance moves to its
+    final value over some frames.
 
-    Like a `Renderer` if no number of frames is given.
+    If `frames` is None, the tolerance moves as in a `Renderer`.
     """
 
     def __init__(
@@ -113,14 +115,14 @@ class Rests:
 
 
 def _goal(scene: Scene, camera: Camera, budget: int, fade: float) -> float:
-    """Return the tolerance that steps move to."""
+    """Return the tolerance towards which the steps move."""
     roomy = budget - budget // _HEADROOM_PARTS
     return select(scene, camera, budget=roomy, fade=fade, device="cpu").tolerance
 
 
 def metrics_of(scene: Scene, camera: Camera) -> tuple[Any, Any]:
-    """Return the metrics of the groups of all instances, px², and the first index of
-    each instance."""
+    """Return the metrics in px² of the groups of all instances, and the index of each
+    instance's first group."""
     instances = _core.Instances(
         bundle=scene.instance_bundle,
         positions=scene.positions,
@@ -134,13 +136,14 @@ def metrics_of(scene: Scene, camera: Camera) -> tuple[Any, Any]:
 
 
 def cut_of(scene: Scene, refinement: Any, offset: Any) -> Selection:
-    """Return the cut of groups that are refined by 0 to 1, none more than the group
-    above it."""
+    """Return the cut for refinements of the groups between 0 and 1. No group may be
+    refined more than the group above it."""
     instance_ids, cluster_ids, weights, count = [], [], [], 0
     for i, b in enumerate(scene.instance_bundle):
         clusters = scene.bundles[b].clusters
         mine = refinement[offset[i] : offset[i + 1]]
-        # Index -1 means no group, and refers to the last element.
+        # Index -1 stands for no group; it refers to the last element, which is
+        # appended.
         weight = (
             np.append(mine, 1.0)[clusters.parent_group] - np.append(mine, 0.0)[clusters.own_group]
         )
@@ -155,8 +158,8 @@ def cut_of(scene: Scene, refinement: Any, offset: Any) -> Selection:
 
 
 class Sticks:
-    """A cut that refines a group above the tolerance times a factor and coarsens it
-    below the quotient."""
+    """A cut with hysteresis: it refines a group whose metric is above the tolerance
+    times a factor, and coarsens it below the tolerance divided by the factor."""
 
     def __init__(self, tolerance: float, factor: float) -> None:
         self.tolerance, self.factor = tolerance, factor
@@ -170,7 +173,8 @@ class Sticks:
 
 
 def between(metric: Any, tolerance: float, fade: float) -> Any:
-    """Return the position of metrics in the range of a fade: 0 below, 1 above."""
+    """Return the positions of metrics within the range of a fade: 0 below it, 1 above
+    it."""
     low, high = tolerance / fade, tolerance * fade
     return np.clip((np.minimum(metric, 2 * high) - low) / (high - low), 0, 1)
 
@@ -188,10 +192,11 @@ class Smooth:
 
 
 class Arrives:
-    """A cut with a fade whose pages all come in after the first frame, and fade in over
-    some frames.
+    """A cut with a fade, in which all pages arrive after the first frame and fade in
+    over some frames.
 
-    All pages fade in together, or those of a level once those above have faded in.
+    With `by_level`, the pages of a level fade in after all coarser levels have faded
+    in; otherwise all pages fade in together.
     """
 
     def __init__(self, tolerance: float, fade: float, frames: int, *, by_level: bool) -> None:
@@ -207,15 +212,16 @@ class Arrives:
         return {"cut": cut_of(scene, np.minimum(ramp, arrived), offset)}
 
     def arrived(self, scene: Scene, camera: Camera) -> Any:
-        """Return how far the pages of the groups of all instances have faded in."""
+        """Return how far the pages of all groups of all instances have faded in, 0 to
+        1."""
         levels = [scene.bundles[b].groups.level for b in scene.instance_bundle]
         waits = np.concatenate([level.max() - level for level in levels]) if self.by_level else 0
         return np.clip(self.frame / self.frames - waits, 0.0, 1.0)
 
 
 class ArrivesInPool(Arrives):
-    """As Arrives, with a renderer's pool, which reads pages while true pictures are
-    drawn."""
+    """Pages that fade in like `Arrives`, read by a renderer's pool while reference
+    pictures are drawn."""
 
     def __init__(self, scene: Scene, tolerance: float, fade: float) -> None:
         super().__init__(tolerance, fade, 0, by_level=True)
@@ -263,7 +269,7 @@ def main(config: Config) -> None:
 
 def to_and_fro(path: CameraPath) -> CameraPath:
     """Return a path that repeats a few frames back and forth, so that the same groups
-    come and go."""
+    are refined and coarsened repeatedly."""
     frames = [abs((k + _SWAY) % (2 * _SWAY) - _SWAY) for k in range(len(path.cameras))]
     return replace(
         path, name="to and fro", cameras=[path.cameras[min(k, len(frames) - 1)] for k in frames]
@@ -271,7 +277,8 @@ def to_and_fro(path: CameraPath) -> CameraPath:
 
 
 def up_to_the_rest(scene: Scene, path: CameraPath, config: Config) -> CameraPath:
-    """Return the path up to where steps are farthest from their goal."""
+    """Return the part of the path up to the frame at which the steps are farthest
+    behind their goal."""
     renderer, budget = Renderer(scene, device="cpu"), budget_of(scene, path.cameras[0], config)
     ways = []
     for camera in path.cameras:

@@ -1,5 +1,5 @@
-"""How long do both eyes of a headset take? One frame of two pictures that share a cut,
-in comparison with two frames."""
+"""How long do the pictures for both eyes of a headset take? One frame of two pictures
+with a shared cut, in comparison with two frames."""
 
 from __future__ import annotations
 
@@ -25,15 +25,21 @@ def main(arguments: list[str] | None = None) -> int:
         "--bundle", type=Path, required=True, help=".v3dg file of the layout's asset"
     )
     parser.add_argument(
-        "--layout", type=Path, required=True, help="scene file of instances and cameras"
+        "--layout", type=Path, required=True, help="scene file with instances and cameras"
     )
     parser.add_argument(
-        "--cameras", type=int, nargs=2, default=(40, 60), help="the first, and that after the last"
+        "--cameras",
+        type=int,
+        nargs=2,
+        default=(40, 60),
+        help=("range of the layout's cameras: the first index, and the index after the last one"),
     )
-    parser.add_argument("--side", type=int, default=2160, help="of the pictures, px")
+    parser.add_argument(
+        "--side", type=int, default=2160, help=("width and height of the pictures in px")
+    )
     parser.add_argument("--tolerances", type=float, nargs="+", default=[9.4, 20.0])
     parser.add_argument("--repeats", type=int, default=11)
-    parser.add_argument("--json", type=Path, help="write the result there")
+    parser.add_argument("--json", type=Path, help="JSON file for the results")
     options = parser.parse_args(arguments)
 
     scene, cameras = read_layout(options.layout, Bundle.open(options.bundle))
@@ -51,7 +57,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def headset(camera: Camera, side: int) -> StereoCamera:
-    """Return eyes at a camera's position, with its rotation."""
+    """Return the cameras of two eyes at the position and with the rotation of a
+    camera."""
     ahead, top = camera.viewmat[2, :3], -camera.viewmat[1, :3]
     middle = Camera.look_at(
         camera.position, camera.position + ahead, top, _FOV, width=side, height=side
@@ -62,8 +69,8 @@ def headset(camera: Camera, side: int) -> StereoCamera:
 def measure(
     renderer: Renderer, stereo: StereoCamera, tolerance: float, repeats: int
 ) -> dict[str, Any]:
-    """Return milliseconds from the call to both pictures, for one frame and for two;
-    and gaussians of the shared cut."""
+    """Return the milliseconds from the call to both pictures, for one frame and for two
+    frames, and the gaussians of the shared cut."""
 
     def one_frame() -> list[Any]:
         return [picture.color for picture in renderer.render(stereo, tolerance=tolerance)]

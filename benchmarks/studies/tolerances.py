@@ -1,14 +1,14 @@
-"""The error of each tolerance: cuts of each asset at several sizes, in comparison with
-all its gaussians.
+"""The error at each tolerance: cuts of each asset at several sizes, in comparison with
+all gaussians.
 
     python -m benchmarks.studies.tolerances ASSETS -o tolerances_cpu
 
-ASSETS is a folder as for `benchmarks.studies.pairs`. An object is drawn so wide that
-its ball fills the picture, a scene from its cameras at the same widths. Cuts, and every
-gaussian at one sample per pixel, are compared with every gaussian at four by four
-samples, or eight by eight for small pictures. The table has FLIP of the cut relative to
-that of all gaussians, the difference of their PSNR, and the fraction of the gaussians
-in the frustum.
+ASSETS is a folder as for `benchmarks.studies.pairs`. An object is drawn at the widths
+at which its ball fills the picture; a scene is drawn from its cameras at the same
+widths. Cuts, and all gaussians at one sample per pixel, are compared with all gaussians
+at 4 x 4 samples per pixel (8 x 8 for small pictures). The table has FLIP of the cut
+relative to that of all gaussians, the difference of their PSNR, and the number of
+gaussians in the frustum relative to all of them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from v3dg.pictures import Picture, to_8bit
 
 Row = dict[str, Any]
 
-_FEW_PX = 128  # px per side; smaller pictures have the finer truth
+_FEW_PX = 128  # width below which the reference has 8 x 8 samples per pixel
 
 
 @dataclass
@@ -41,21 +41,21 @@ class Config:
     assets: tyro.conf.Positional[Path]
     """Folder with assets.json."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File of the results, without its suffix."""
+    """File for the results, without suffix."""
     only: tuple[str, ...] = ()
-    """Names of assets; all by default."""
+    """Names of the assets to measure; by default all."""
     tolerances: tuple[float, ...] = (1.5, 3.0, 4.5, 6.0, 9.0, 12.0)
     widths: tuple[int, ...] = (512, 256, 128, 64, 32)
     """px."""
     views: int = 4
     refine: int = 0
-    """Steps of the refinement, which is also measured."""
+    """Steps of a refinement to measure as well; 0 for none."""
     device: str = "auto"
 
 
 def measure(config: Config, subject: Subject, judges: Judges) -> list[Row]:
-    """Return means over the views, for each width and tolerance; tolerance 0 is every
-    gaussian."""
+    """Return means over the views for each width and tolerance. Tolerance 0 draws all
+    gaussians."""
     found: dict[tuple[int, float], list[Row]] = {}
     for (about, _, _), errors in judges.measured(_drawn(config, subject), _errors):
         found.setdefault((about["width"], about["tolerance"]), []).append({**about, **errors})
@@ -94,7 +94,7 @@ def _errors(item: tuple[Row, Picture, Picture]) -> Row:
 
 
 def summary(rows: list[Row]) -> str:
-    """Return a row per tolerance: means over the assets and widths, and the worst
+    """Return a row per tolerance, with means over assets and widths, and the worst
     case."""
     whole = {(row["asset"], row["width"]): row for row in rows if row["tolerance"] == 0}
     lines = []

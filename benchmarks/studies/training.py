@@ -1,9 +1,9 @@
 """Does training with v3dg instead of gsplat give the same result, and how long does a
 step take?
 
-Gaussians are trained from scratch on pictures of an asset with gsplat's own strategies,
-drawn by either of the two, and compared on held-out pictures. Needs a GPU, and gsplat
-1.5.3 compiled.
+Gaussians are trained from random positions on pictures of an asset with gsplat's
+strategies. Pictures are drawn by v3dg or by gsplat, and the results are compared on
+held-out pictures. The study needs a GPU and a compiled gsplat 1.5.3.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from benchmarks.studies.peers.scenes import random as random_scene
 from v3dg.compat.gsplat import rasterization
 
 _DRAWN_BY: dict[str, Callable[..., Any]] = {"v3dg": rasterization, "gsplat": gsplat.rasterization}
-_REPEATS = 31  # of a timed step
-_SIDE = 512  # px of a training picture
+_REPEATS = 31  # number of timed calls of a step
+_SIDE = 512  # width and height of a training picture in px
 _STEP = {
     "means": 1.6e-4,
     "quats": 1e-3,
@@ -47,9 +47,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument(
-        "--gaussians", type=int, default=1_000_000, help="of the steps that are timed"
+        "--gaussians", type=int, default=1_000_000, help="number of gaussians for the timed steps"
     )
-    parser.add_argument("--json", type=Path, help="write the result there")
+    parser.add_argument("--json", type=Path, help="JSON file for the results")
     options = parser.parse_args(arguments)
 
     result: dict[str, Any] = {"steps": [], "training": []}
@@ -70,7 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def times(count: int, num_cameras: int) -> list[dict[str, Any]]:
-    """Return milliseconds of a picture, and of one with its gradients, for random
+    """Return milliseconds of a picture, and of a picture with its gradients, for random
     gaussians of SH degree 3."""
     scene = random_scene(count, 3, "cuda")
     camera, gaussians = next(iter(scene.cameras.values())), scene.gaussians
@@ -110,7 +110,7 @@ def times(count: int, num_cameras: int) -> list[dict[str, Any]]:
 
 
 class Views:
-    """Pictures of an asset from 80 sides, of which every eighth is held out."""
+    """Pictures of an asset from 80 sides; every eighth picture is held out."""
 
     def __init__(self, asset: v3dg.Gaussians) -> None:
         self.low, self.high = (np.percentile(asset.means, q, axis=0) for q in (0.5, 99.5))
@@ -138,7 +138,8 @@ class Views:
         self.held_out, self.trained = numbers[numbers % 8 == 0], numbers[numbers % 8 != 0]
 
     def start(self, count: int) -> dict[str, torch.nn.Parameter]:
-        """Return grey gaussians at random positions in the box of the asset."""
+        """Return grey gaussians at random positions in the bounding box of the
+        asset."""
         low, high = (
             torch.tensor(a, dtype=torch.float32, device="cuda") for a in (self.low, self.high)
         )
@@ -167,7 +168,8 @@ def strategy_of(name: str, steps: int, size: float) -> tuple[Any, dict[str, Any]
 def train(
     views: Views, name: str, seed: int, steps: int, draw: Callable[..., Any]
 ) -> dict[str, Any]:
-    """Return PSNR on the held-out pictures, gaussians, seconds."""
+    """Train gaussians; return the PSNR on the held-out pictures, the number of
+    gaussians, and the seconds."""
     torch.manual_seed(seed)
     order = torch.Generator().manual_seed(seed)
     params = views.start(20_000)
@@ -228,7 +230,7 @@ def train(
 
 
 def structure(first: Any, second: Any) -> Any:
-    """Return the SSIM of (1, H, W, 3) pictures, 11 px."""
+    """Return the SSIM of (1, H, W, 3) pictures, with a window of 11 x 11 px."""
     bell = torch.exp(-((torch.arange(11, device="cuda") - 5.0) ** 2) / (2 * 1.5**2))
     bell = bell / bell.sum()
     window = (bell[:, None] * bell).expand(3, 1, 11, 11)

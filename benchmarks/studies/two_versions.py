@@ -1,15 +1,15 @@
-"""The results of one version of v3dg, as digests, and their times, for comparison with
-another version.
+"""Results of a version of v3dg as digests, and their times, for a comparison of two
+versions.
 
-Run it once or more with each version in alternation, on one machine, then compare the
-outputs:
+Run it one or more times with each version, in alternation on one machine, and then
+compare the outputs:
 
     PYTHONPATH=old python -m benchmarks.studies.two_versions --output old.json ...
     PYTHONPATH=new python -m benchmarks.studies.two_versions --output new.json ...
     python -m benchmarks.studies.two_versions --compare old.json new.json
 
-It uses only the public interface, so that a version with a different layout of modules
-can run it, too.
+The study uses only the public interface, so that it also runs with versions whose
+modules are organised differently.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def host(array: Any) -> np.ndarray[Any, Any]:
 
 
 def digest(*arrays: Any) -> str:
-    """Return a digest of the arrays' bytes."""
+    """Return a digest of the bytes of arrays."""
     found = hashlib.blake2b(digest_size=8)
     for array in arrays:
         found.update(np.ascontiguousarray(host(array)).tobytes())
@@ -44,7 +44,7 @@ def digest(*arrays: Any) -> str:
 
 
 def random_gaussians(count: int, sh_degree: int, seed: int = 0) -> v3dg.Gaussians:
-    """Return gaussians in a ball, with the sizes of training."""
+    """Return gaussians in a ball, with the sizes that training gives."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(count, 3))
     means *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(means, axis=1, keepdims=True)
@@ -59,7 +59,7 @@ def random_gaussians(count: int, sh_degree: int, seed: int = 0) -> v3dg.Gaussian
 
 
 class Run:
-    """Digests and times of one version on one device."""
+    """The digests and times of one version on one device."""
 
     def __init__(self, device: str, repeats: int) -> None:
         self.device, self.repeats = device, repeats
@@ -131,7 +131,7 @@ class Run:
             self.host_part(name, scene, next(iter(cameras.values())))
 
     def host_part(self, name: str, scene: Any, camera: v3dg.Camera) -> None:
-        """Record the time until a frame is enqueued, without waiting for the device."""
+        """Record the time until a frame is enqueued, without the time of the device."""
         renderer = v3dg.Renderer(scene)
         for _ in range(20):
             renderer.render(camera, tolerance=9.4).stats  # noqa: B018
@@ -167,19 +167,19 @@ class Run:
             return leaves
 
         self.time(f"forward + backward {count}", both)
-        # The sign of a zero gradient may differ between runs of one version; adding 0
-        # removes it.
+        # The sign of a zero gradient may differ between runs of the same version;
+        # adding 0 makes it positive.
         self.digests[f"gradients {count}"] = digest(*(leaf.grad + 0.0 for leaf in leaves))
 
 
 def compare(old_path: Path, new_path: Path, output: Path | None) -> int:
-    """Print the differences, and write them if requested; return the number of digests
-    that differ."""
+    """Print the differences, and write them to `output` if it is given; return the
+    number of digests that differ."""
     old, new = (json.loads(path.read_text()) for path in (old_path, new_path))
     names = sorted(old["digests"].keys() | new["digests"].keys())
     differ = [name for name in names if old["digests"].get(name) != new["digests"].get(name)]
     print(
-        f"{len(names) - len(differ)} of {len(names)} digests are the same; others: "
+        f"{len(names) - len(differ)} of {len(names)} digests are equal; different ones: "
         f"{differ or 'none'}"
     )
     times = {}
@@ -230,13 +230,21 @@ def main() -> None:
     )
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument(
-        "--layout", type=Path, help="a layout of instances, for frames of a whole scene"
+        "--layout", type=Path, help="layout of instances, for frames of a whole scene"
     )
     parser.add_argument("--cameras", type=int, nargs="*", default=[40, 46, 50, 59])
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--count", type=int, default=100_000, help="gaussians that are rasterized")
-    parser.add_argument("--output", type=Path, help="written, or added to where it is there")
-    parser.add_argument("--commit", default="", help="of the version that runs")
+    parser.add_argument(
+        "--count", type=int, default=100_000, help=("number of gaussians to rasterize")
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        help=("JSON file for the results; results are added to an existing file"),
+    )
+    parser.add_argument(
+        "--commit", default="", help=("commit of the measured version, recorded in the results")
+    )
     parser.add_argument("--compare", type=Path, nargs=2, metavar=("OLD", "NEW"))
     arguments = parser.parse_args()
     if arguments.compare:
@@ -253,7 +261,8 @@ def main() -> None:
     if arguments.layout:
         from v3dg import read_scene
 
-        read_asset = getattr(v3dg, "read_asset", None) or v3dg.load  # the name in an older version
+        # Older versions call it `load`.
+        read_asset = getattr(v3dg, "read_asset", None) or v3dg.load
         asset = read_asset(
             arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"]
         )

@@ -1,15 +1,16 @@
-"""The error of a scene after dropping gaussians that are hardly visible, and the effect
-of a refit.
+"""The error of a scene after gaussians that are hardly visible are dropped, and the
+effect of a refit.
 
     python -m benchmarks.studies.unseen ASSETS --only Paljassaare -o unseen_cpu
 
-ASSETS is a folder as for `benchmarks.studies.pairs`; its scenes are measured from their
-own cameras. Other cameras, beside those and with other directions, determine which
-gaussians are least visible; these are dropped, as by `examples/drop_unseen.py`. The
-rest may be refitted to pictures of all gaussians from the same other cameras, 3 x 3
-samples per pixel, or be drawn with levels. Errors are against all gaussians at 4 x 4
-samples per pixel. The table has the fraction of the gaussians in the frustum, and FLIP
-relative to that of all gaussians at one sample.
+ASSETS is a folder as for `benchmarks.studies.pairs`. Its scenes are measured from their
+own cameras. Other cameras, near these and with other directions, determine which
+gaussians are least visible. These gaussians are dropped, as by
+`examples/drop_unseen.py`. The remaining gaussians may be refitted to pictures of all
+gaussians from the same other cameras with 3 x 3 samples per pixel, or be drawn with
+levels. Errors are against all gaussians at 4 x 4 samples per pixel. The table has the
+fraction of the gaussians in the frustum, and FLIP relative to that of all gaussians at
+one sample per pixel.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ from v3dg.pictures import to_8bit
 
 Row = dict[str, Any]
 
-# The range of the tangent of the field of view, relative to the scene's own cameras.
+# Range of the tangent of the field of view, relative to the scene's cameras.
 _NARROWEST, _WIDEST = 0.9, 1.25
-_PITCH = 0.4  # radians, at most
+_PITCH = 0.4  # radians; the maximum pitch
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "drop_unseen.py"
-# Adam's initial step sizes in a refit: means in median scales, scales as logarithms,
-# opacities as logits.
+# Adam's initial step sizes in a refit: means in units of the median scale, scales as
+# logarithms, opacities as logits.
 _SIZES = {
     "means": 3e-3,
     "quats": 1.5e-4,
@@ -51,7 +52,7 @@ _SIZES = {
     "sh0": 4.5e-4,
     "rest": 6e-5,
 }
-_LAST_STEP = 0.01  # relative to the first step
+_LAST_STEP = 0.01  # final step size, relative to the initial one
 _SAMPLES = 3
 
 
@@ -60,36 +61,36 @@ class Config:
     assets: tyro.conf.Positional[Path]
     """Folder with assets.json."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File of the results, without its suffix."""
+    """File for the results, without suffix."""
     only: tuple[str, ...] = ()
-    """Names of scenes; all by default."""
+    """Names of the scenes to measure; by default all."""
     parts: tuple[float, ...] = (1.0, 0.9, 0.8, 0.7, 0.6)
     """Fractions of the visible gaussians to keep."""
     refit: tuple[float, ...] = ()
-    """The fractions of `parts` that are also refitted."""
+    """Fractions, from `parts`, for which the gaussians are also refitted."""
     tolerances: tuple[float, ...] = ()
-    """Tolerances at which the rest is also drawn with levels."""
+    """Tolerances at which the kept gaussians are also drawn with levels."""
     steps: int = 4000
-    """Steps of a refit, one picture each."""
+    """Number of steps of a refit, with one picture each."""
     width: int = 384
-    """px of the pictures for measuring weights and for refitting."""
+    """Width in px of the pictures for the weights and for the refit."""
     widths: tuple[int, ...] = (384,)
-    """px of the pictures that are compared."""
+    """Widths in px of the compared pictures."""
     views: int = 4
     """Number of cameras from which errors are measured."""
     others: int = 48
-    """Number of cameras from which weights are measured."""
+    """Number of cameras from which the visibility of gaussians is measured."""
     distance: float = 0.3
-    """Approximate distance, in world units, from a camera of the scene to another
-    one."""
+    """Approximate distance in world units between another camera and a camera of the
+    scene."""
     turn: float = math.pi
-    """Largest rotation of another camera, radians."""
+    """Maximum rotation of another camera in radians."""
     seed: int = 0
     device: Literal["cpu", "cuda"] = "cpu"
 
 
 def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camera]:
-    """Return cameras beside the given ones, rotated by evenly distributed angles."""
+    """Return cameras near the given ones, rotated by evenly distributed angles."""
     rng = np.random.default_rng(config.seed)
     poses = [np.linalg.inv(camera.viewmat.astype(np.float64)) for camera in cameras]
     up = -np.mean([pose[:3, 1] for pose in poses], axis=0)
@@ -114,8 +115,8 @@ def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camer
 def refitted(
     kept: v3dg.Gaussians, asset: v3dg.Gaussians, cameras: Sequence[v3dg.Camera], config: Config
 ) -> v3dg.Gaussians:
-    """Return the kept gaussians, fitted by Adam to pictures of the asset, one picture
-    per step."""
+    """Return the kept gaussians after a fit by Adam to pictures of the asset, one
+    picture per step."""
     import torch
 
     device, steps = config.device, config.steps
@@ -152,7 +153,7 @@ def refitted(
 
 
 def measure(config: Config, subject: Subject) -> list[Row]:
-    """Return means over the views, for each width and fraction."""
+    """Return means over the views for each width and fraction."""
     asset = subject.asset.numpy()
     others = others_of(config, subject.cameras)
     weights_in = runpy.run_path(str(_EXAMPLE))["weights_in"]

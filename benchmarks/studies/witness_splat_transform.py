@@ -1,16 +1,17 @@
 """One asset drawn by v3dg and by splat-transform, a renderer that shares no code with
-it.
+v3dg.
 
-It needs Node 22 or newer, `npm install @playcanvas/splat-transform@3.7.0`, and a Vulkan
-device; without a GPU the software device that comes with Chromium does (SwiftShader:
-`VK_ICD_FILENAMES` names its vk_swiftshader_icd.json, `XDG_RUNTIME_DIR` a directory).
+The study needs Node 22 or newer, `npm install @playcanvas/splat-transform@3.7.0`, and a
+Vulkan device. Without a GPU, the software device of Chromium (SwiftShader) suffices:
+`VK_ICD_FILENAMES` is the path of its vk_swiftshader_icd.json, and `XDG_RUNTIME_DIR` is
+a directory.
 
-Both add the 0.3 px² of the original 3DGS code, but splat-transform clamps alpha at 0.99
-and ends each gaussian at three standard deviations, where its falloff reaches 0. So a
-third picture is made: the float64 reference of the tests, which the core is tested
-against, with splat-transform's falloff. It must equal theirs up to the rounding to 8
-bits (58.9 dB); then projection, colour, order and blending are the same, and the
-remaining difference is due to the falloff.
+Both renderers add the 0.3 px² of the original 3DGS code, but splat-transform clamps
+alpha at 0.99 and ends each gaussian at three standard deviations, where its falloff
+reaches 0. So a third picture is drawn, by the float64 reference of the tests with
+splat-transform's falloff. It must equal splat-transform's picture up to the rounding to
+8 bits (58.9 dB). Then projection, colour, order and blending are the same, and the
+remaining difference of v3dg's picture is due to the falloff.
 """
 
 from __future__ import annotations
@@ -44,28 +45,28 @@ THEIR_REACH_SIGMAS = 3.0
 @dataclass
 class Config:
     asset: Annotated[Path, tyro.conf.Positional]
-    """A .ply file."""
+    """Asset to draw, a .ply file."""
     splat_transform: str
-    """The command that starts it, such as "node node_modules/.bin/splat-transform"."""
+    """Command that starts splat-transform, such as "node
+    node_modules/.bin/splat-transform"."""
     size: int = 400
     fov: float = 50.0
-    """Vertical and horizontal field of view in degrees."""
+    """Horizontal and vertical field of view in degrees."""
     views: int = 4
     distance: float = 2.0
     """Distance from the centre of the asset, in radii of the ball that contains nearly
-    all of it.
-    """
+    all of its gaussians."""
     background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
     keep: Path | None = None
-    """Directory to keep the pictures in."""
+    """Folder for the pictures; by default they are not kept."""
     json: bool = False
 
 
 def witness(config: Config, camera: v3dg.Camera, target: np.ndarray, path: Path) -> np.ndarray:
-    """Return their picture (H,W,3) from the same position."""
+    """Return the picture (H,W,3) that splat-transform draws from the same position."""
 
     def point(p: np.ndarray) -> str:
-        # Their world is rotated by half a turn about z relative to the file's.
+        # splat-transform rotates the file's axes by half a turn about z.
         return f"{-p[0]:.9g},{-p[1]:.9g},{p[2]:.9g}"
 
     command = [
@@ -86,7 +87,7 @@ def witness(config: Config, camera: v3dg.Camera, target: np.ndarray, path: Path)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0 or not path.exists():
         sys.exit(
-            f"splat-transform: failed with {done.returncode}: "
+            f"splat-transform: failed with exit code {done.returncode}: "
             f"{(done.stderr or done.stdout).strip()}"
         )
     return np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
@@ -95,7 +96,8 @@ def witness(config: Config, camera: v3dg.Camera, target: np.ndarray, path: Path)
 def with_their_falloff(
     asset: v3dg.Gaussians, camera: v3dg.Camera, background: tuple[float, ...]
 ) -> np.ndarray:
-    """Return the tests' reference picture (H,W,3), with splat-transform's falloff."""
+    """Return the reference picture (H,W,3) of the tests, with splat-transform's
+    falloff."""
     projection = project(asset, camera, filter_px2=FILTER_PX2)
     colors = reference_sh.color(asset.sh, asset.means - camera.position)
     largest = np.linalg.eigvalsh(

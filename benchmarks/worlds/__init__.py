@@ -1,13 +1,15 @@
-"""Worlds of about 100 million gaussians, like the four of the V3DG paper, from assets
-made here.
+"""Worlds of about 100 million gaussians, like the four scenes of the V3DG paper, from
+generated assets.
 
-A world defines the positions of assets. Making the assets, building their bundles and
-placing those in a scene are separate steps:
+A world defines where assets are placed. Making the assets, building their bundles and
+composing the scene are separate steps:
 
-    world = worlds.forest(instances=60, num_gaussians=20_000) bundles = {name:
-    v3dg.build_bundle(asset.make()) for name, asset in world.assets.items()} scene =
-    worlds.scene_of(world, bundles) image = v3dg.render(scene,
-    world.cameras()["000_camera_0"])
+    world = worlds.forest(instances=60, num_gaussians=20_000)
+    bundles = {
+        name: v3dg.build_bundle(asset.make()) for name, asset in world.assets.items()
+    }
+    scene = worlds.scene_of(world, bundles)
+    image = v3dg.render(scene, world.cameras()["000_camera_0"])
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from v3dg.scene.file import write_scene
 
 @dataclass(frozen=True)
 class Asset:
-    """An asset to be made: the function that makes it, and its number of gaussians."""
+    """A generated asset: the function that makes it, and its number of gaussians."""
 
     make: Callable[[], Gaussians]
     num_gaussians: int
@@ -48,9 +50,9 @@ class Placement:
     """The poses of the I instances of one asset.
 
     Attributes:
-        positions: (I, 3) world units.
-        quaternions: (I, 4) w x y z.
-        scales: (I,)
+        positions: (I, 3) positions in world units.
+        quaternions: (I, 4) rotations as w, x, y, z.
+        scales: (I,) scale factors.
     """
 
     positions: Floats
@@ -63,10 +65,10 @@ class Placement:
 
 @dataclass(frozen=True)
 class World:
-    """Assets and their placements, by the assets' names.
+    """Assets and their placements, by the names of the assets.
 
     Attributes:
-        extent: Distance of the farthest cameras from the origin.
+        extent: Distance of the farthest cameras from the origin, in world units.
     """
 
     name: str
@@ -80,14 +82,14 @@ class World:
 
     @property
     def num_gaussians(self) -> int:
-        """Gaussians of all instances at full detail."""
+        """The number of gaussians of all instances at full detail."""
         return sum(
             len(self.placements[name]) * asset.num_gaussians for name, asset in self.assets.items()
         )
 
     def cameras(self, *, width: int = 1920, height: int = 1080) -> dict[str, Camera]:
-        """Return the paper's 400 cameras around the origin, up to the world's
-        extent."""
+        """Return the paper's 400 cameras around the origin, at distances up to the
+        world's extent."""
         return trajectories((0.0, 0.0, 0.0), self.extent, width=width, height=height)
 
 
@@ -95,7 +97,7 @@ def scene_of(world: World, bundles: Mapping[str, Bundle]) -> Scene:
     """Place bundles as a world defines.
 
     Args:
-        bundles: One for each of the world's assets, by its name.
+        bundles: A bundle for each of the world's assets, by the asset's name.
 
     Raises:
         ValueError: A bundle is missing.
@@ -112,8 +114,8 @@ def scene_of(world: World, bundles: Mapping[str, Bundle]) -> Scene:
 
 
 def donut_sea(instances: int = 2048, num_gaussians: int = 45_624, *, seed: int = 0) -> World:
-    """Make a pile of donuts that have fallen onto the ground, with scales from 3/4 to
-    1.
+    """Make a pile of donuts that lie on the ground after a fall, with scales from 3/4
+    to 1.
 
     Args:
         instances: Number of donuts.
@@ -132,15 +134,17 @@ def donut_sea(instances: int = 2048, num_gaussians: int = 45_624, *, seed: int =
     return World("donut_sea", {"donut": asset}, {"donut": placement}, 2.6 * reach)
 
 
-_FALL_STEPS = 50  # sixtieths of a second: then the highest donuts have fallen and the pile is calm
+# In units of 1/60 s; after this time the highest donuts have fallen and the pile is at
+# rest.
+_FALL_STEPS = 50
 
 
 def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: float = 0.03) -> Pile:
-    """Place donuts in the air, about `layers` above each other, ready to fall, without
-    contacts.
+    """Place donuts in the air without contacts, in about `layers` layers, so that they
+    can fall.
 
     Args:
-        gap: Free space between donuts of full size, for any rotation.
+        gap: Free space between donuts of full size, at any rotation.
     """
     if instances < 1:
         raise ValueError(f"instances: expected at least 1, got {instances}")
@@ -154,8 +158,8 @@ def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: flo
     plane = pitch * np.stack([i + 0.5 * j, np.sqrt(0.75) * j], -1)
     plane = plane[np.argsort(np.hypot(*plane.T), kind="stable")[:a_layer]]
     layer, cell = np.divmod(np.arange(instances), a_layer)
-    # Layers are above the gaps of those below, as in a close packing, and slightly
-    # rotated.
+    # A layer lies above the gaps of the layer below, as in a close packing, and is
+    # slightly rotated.
     shift = pitch * np.array([0.5, np.sqrt(1 / 12)]) * (layer % 2)[:, None]
     jitter = rng.uniform(-0.4, 0.4, (instances, 3)) * gap / np.sqrt(3)
     height = RING + TUBE + gap + layer * pitch
@@ -170,8 +174,8 @@ def forest(instances: int = 400, num_gaussians: int = 315_630, *, seed: int = 0)
     crowns hardly touch.
 
     Args:
-        num_gaussians: Average number for each of the eight assets; kinds have 0.6 to
-            1.4 times as many.
+        num_gaussians: Mean number of gaussians per asset; the eight kinds have 0.6 to
+            1.4 times the mean.
     """
     shares = np.linspace(0.6, 1.4, len(TREE_KINDS))[
         np.random.default_rng([seed, 1]).permutation(len(TREE_KINDS))
@@ -198,8 +202,8 @@ def temples(instances: int = 100, num_gaussians: int = 1_350_487, *, seed: int =
 def crowd(
     instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 16, seed: int = 0
 ) -> World:
-    """Make a crowd in a square grid that looks in one direction, with its feet at z =
-    -0.85.
+    """Make a crowd of persons in a square grid. All look in one direction, and their
+    soles are at z = -0.85.
 
     Args:
         num_gaussians: Number of gaussians of each asset.
@@ -215,11 +219,11 @@ def crowd(
     pitch, side = 1.2, int(np.ceil(np.sqrt(instances)))
     row, column = np.divmod(np.arange(instances), side)
     half = 0.5 * (side - 1)
-    # Cameras look at the origin, which is at half of the persons' height, because there
-    # is nothing between their feet.
+    # The cameras look at the origin. The origin is at half of the persons' height,
+    # because there is nothing to see between their feet.
     heights = np.full(instances, -0.85)
     positions = np.stack([pitch * (column - half), pitch * (row - half), heights], -1)
-    # All persons occur equally often, and neighbours differ.
+    # All persons occur equally often, and neighbours are different persons.
     who = np.concatenate(
         [
             np.random.default_rng([seed, i]).permutation(persons)
@@ -248,7 +252,7 @@ def _scattered(
     seed: int,
 ) -> World:
     """Place assets on the plane one after the other, at random positions where they
-    touch no other."""
+    touch no asset placed before."""
     if instances < 1:
         raise ValueError(f"instances: expected at least 1, got {instances}")
     rng = np.random.default_rng(seed)
@@ -258,7 +262,8 @@ def _scattered(
     )[:instances]
     size = rng.uniform(*scales, instances)
     room = size * np.array([radii[names[k]] for k in which])
-    # Discs that are dropped one after the other cover about this fraction of the plane.
+    # Discs that are placed at random one after the other cover about this fraction of
+    # the plane.
     extent = np.sqrt((room**2).sum() / 0.50)
     places = np.zeros((instances, 2))
     for i in range(1, instances):
@@ -282,8 +287,8 @@ def _clear_place(
     extent: float,
     rng: np.random.Generator,
 ) -> npt.NDArray[np.float64]:
-    """Return a random position where a disc touches no other; the search area grows if
-    there is none."""
+    """Return a random position where a disc touches no other disc. The search area
+    grows until there is one."""
     while True:
         r, a = extent * np.sqrt(rng.random(400)), rng.uniform(0, 2 * np.pi, 400)
         tried = np.stack([r * np.cos(a), r * np.sin(a)], -1)
@@ -306,7 +311,7 @@ SMALL: dict[str, dict[str, int]] = {
     "temples": {"instances": 12, "num_gaussians": 100_000},
     "crowd": {"instances": 64, "num_gaussians": 20_000, "persons": 4},
 }
-"""Arguments of worlds that a CPU builds in a minute or two."""
+"""Arguments of `WORLDS` for small worlds, which a CPU builds in one or two minutes."""
 
 
 def write_world(
@@ -319,22 +324,22 @@ def write_world(
     resume: bool = False,
     progress: bool = True,
 ) -> Path:
-    """Make a world's assets, build their bundles, and write them with a scene file and
-    its cameras.
+    """Make a world's assets, build their bundles, and write the assets, the bundles,
+    and a scene file with cameras.
 
     Args:
-        folder: Created if necessary. It gets ASSET.ply and ASSET.v3dg for each asset,
-            and WORLD.json.
-        config: Settings of the builds; the defaults of `build_bundle` if None.
+        folder: Folder for ASSET.ply and ASSET.v3dg of each asset and for WORLD.json. It
+            is created if it does not exist.
+        config: Settings of the builds; None for the defaults of `build_bundle`.
         seed: Seed of the builds.
-        resume: Keep the bundles and finished levels of an interrupted call.
+        resume: Whether to keep the bundles and finished levels of an interrupted call.
 
     Returns:
-        The scene file's path.
+        The path of the scene file.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed; finished work can be resumed.
-        ValueError, RuntimeError, OSError, MemoryError: See `build_bundle`.
+        KeyboardInterrupt: Ctrl-C was pressed; a call with `resume` continues.
+        ValueError, RuntimeError, OSError, MemoryError: As for `build_bundle`.
     """
     from tqdm import tqdm
 
@@ -366,8 +371,8 @@ def write_world(
 
 
 def _is_same(read: Gaussians, made: Gaussians) -> bool:
-    """Return whether gaussians read from a file are those that were written, up to the
-    rounding of logarithms and logits."""
+    """Return whether gaussians that were read from a file equal the written ones, up to
+    the rounding of logarithms and logits."""
     return len(read) == len(made) and all(
         np.allclose(a, b, rtol=1e-5, atol=1e-6)
         for a, b in (

@@ -1,4 +1,4 @@
-"""`python -m benchmarks world`."""
+"""The command `python -m benchmarks world`."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ class World:
     """Make a world: its assets, their bundles, and a scene file with 400 cameras."""
 
     name: tyro.conf.Positional[Literal["donut_sea", "forest", "temples", "crowd"]]
-    """Which of the V3DG paper's four."""
+    """World to make, one of the four scenes of the V3DG paper."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
-    """Folder to write to, made if it is not there; the world's name if not given."""
+    """Folder for the files, created if it does not exist; by default the name of the
+    world."""
     scale: Literal["small", "full"] = "small"
-    """How large: full is about 100 million gaussians, and hours of a CPU or minutes of
-    a GPU."""
+    """Size of the world: full is about 100 million gaussians and takes hours on a CPU
+    or minutes on a GPU; small takes one or two minutes on a CPU."""
     seed: int = 0
-    """Seed of the assets, of the layout and of the builds."""
+    """Seed of the assets, the layout and the builds."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to build; auto is a CUDA device where there is one and torch can use it."""
+    """Device for the builds; auto is a CUDA device if torch can use one, else the
+    CPU."""
     resume: Flag = False
-    """Continue an interrupted run: keep what is finished."""
+    """Continue an interrupted run with the bundles and levels that are finished."""
     threads: Threads = None
-    """CPU threads; all if not given."""
+    """Number of CPU threads; by default one for each core."""
     json: Flag = False
     """Print the result as JSON."""
     quiet: Flag = False

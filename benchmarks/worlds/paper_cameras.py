@@ -1,4 +1,4 @@
-"""The camera trajectories with which the V3DG paper measures its scenes."""
+"""The camera trajectories of the V3DG paper's measurements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from v3dg.cameras import DEFAULT_FOV_X, Camera, VectorLike, turntable
 
 ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
-"""Elevations in degrees above the ground."""
+"""Elevations of the cameras in degrees above the ground."""
 NUM_DIRECTIONS, NUM_DISTANCES = 4, 20
 
 
@@ -23,18 +23,19 @@ def trajectories(
     """Return the paper's 400 cameras: 4 directions, 5 elevations and 20 distances, all
     looking at the centre.
 
-    The directions are those of +y, -x, -y and +x in this order; for each, elevations of
-    15 to 75 degrees; for each, distances of 1/20 to 20/20 of the radius. With the
-    origin and radius 9 they are those of the published DonutSea. Up is z.
+    The outer loop is over the directions +y, -x, -y and +x, the next one over
+    elevations of 15 to 75 degrees, and the inner one over distances of 1/20 to 20/20 of
+    the radius. With the origin and a radius of 9, the cameras are those of the
+    published DonutSea. The up axis is z.
 
     Args:
-        center: (3,) point in the world.
+        center: (3,) point in world space.
         radius: Distance of the farthest cameras; > 0.
         fov_x: Horizontal field of view in radians.
 
     Returns:
-        Cameras by name in that order, "000_camera_0" to "399_camera_19": the index
-        among all cameras, and that of the distance.
+        Cameras by name in this order, "000_camera_0" to "399_camera_19". A name has the
+        index of the camera and the index of its distance.
 
     Raises:
         ValueError: The radius is not a positive number.
@@ -46,7 +47,7 @@ def trajectories(
         for elevation in ELEVATIONS:
             for step in range(NUM_DISTANCES):
                 distance = radius * (step + 1) / NUM_DISTANCES
-                # The turntable begins at +x and turns towards +y.
+                # `turntable` begins at +x and rotates towards +y.
                 around = turntable(
                     center,
                     distance,

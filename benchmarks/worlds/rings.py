@@ -1,10 +1,10 @@
-"""Donuts that fall into a pile: rigid rings with round tubes, on the ground and on each
-other.
+"""Donuts that fall into a pile: rigid rings with round tubes that touch the ground and
+each other.
 
-Position-based rigid bodies (Müller et al., Detailed Rigid Body Simulation with Extended
-Position Based Dynamics, SCA 2020), with all contacts of a substep together. A contact
-of two rings is where the circles at the centres of their tubes are closest, so rings
-touch as tori and not as chains of balls.
+The simulation uses position-based rigid bodies (Müller et al., Detailed Rigid Body
+Simulation with Extended Position Based Dynamics, SCA 2020), and solves all contacts of
+a substep together. Two rings touch where the circles that are the axes of their tubes
+are closest, so rings have the exact contacts of tori.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from v3dg.rotations import rotation_from_quaternion
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-_GROUND_SAMPLES = 8  # points around a ring where it may touch the ground
-_PAIR_SAMPLES = 6  # points where the search for the closest points of two rings begins
+_GROUND_SAMPLES = 8  # number of points of a ring that are tested against the ground
+# Number of points from which the closest points of two rings are searched.
+_PAIR_SAMPLES = 6
 _SUBSTEPS = 4
 _FRICTION = 0.5
-_SOFTNESS = 1.5  # fraction of the speed per second that a contact removes
-_RELAX = 0.7  # factor of the summed corrections of contacts, each of which ignores the others
+_SOFTNESS = 1.5  # fraction of the speed that a contact removes per second
+# Factor of the summed corrections, because each contact ignores the others.
+_RELAX = 0.7
 
 
 class Pile:
@@ -32,8 +34,9 @@ class Pile:
 
     Attributes:
         positions: (N, 3) centres.
-        quaternions: (N, 4) w x y z, unit length; a ring's axis is its own z.
-        scales: (N,) scales of ring and tube.
+        quaternions: (N, 4) rotations as w, x, y, z of length 1; the axis of an
+            unrotated ring is z.
+        scales: (N,) scale factors of ring and tube.
     """
 
     def __init__(
@@ -49,13 +52,13 @@ class Pile:
         """Place rings at rest.
 
         Args:
-            ring: Radius of the tube's axis, at scale 1.
+            ring: Radius of the circle that is the axis of the tube, at scale 1.
             tube: Radius of the tube, at scale 1; less than ``ring``.
             gravity: Length units per s².
 
         Raises:
-            ValueError: Shapes are inconsistent, or the tube is not thinner than the
-                ring.
+            ValueError: The shapes of the arrays do not match, or ``tube`` is not
+                between 0 and ``ring``.
         """
         self.positions = np.array(positions, dtype=np.float64)
         self.quaternions = np.array(quaternions, dtype=np.float64)
@@ -78,7 +81,8 @@ class Pile:
         self._gravity = gravity
         self._velocities = np.zeros((count, 3))
         self._spins = np.zeros((count, 3))
-        # For a uniform torus of mass 1: moments about a diameter and about the axis.
+        # The moments of inertia of a uniform torus of mass 1, about a diameter and
+        # about the axis.
         about_axis = self.ring**2 + 0.75 * self.tube**2
         about_diameter = 0.5 * self.ring**2 + 0.625 * self.tube**2
         mass = self.scales**3
@@ -89,14 +93,14 @@ class Pile:
         return len(self.scales)
 
     def step(self, seconds: float = 1 / 60) -> None:
-        """Advance the time, at most about a sixtieth of a second for a steady pile."""
+        """Advance the simulation, by at most about 1/60 s for a stable pile."""
         pairs = self._pairs_within(seconds)
         for _ in range(_SUBSTEPS):
             self._substep(seconds / _SUBSTEPS, pairs)
 
     def relax(self, iterations: int = 40) -> None:
-        """Separate overlapping rings without advancing the time; all are at rest
-        afterwards."""
+        """Separate overlapping rings without advancing time; afterwards all rings are
+        at rest."""
         self._velocities[:], self._spins[:] = 0, 0
         pairs = self._pairs_within(1 / 60)
         for _ in range(iterations):
@@ -107,8 +111,8 @@ class Pile:
             self._separate(contacts, rotations, self.positions.copy(), self.quaternions.copy())
 
     def deepest_overlap(self) -> float:
-        """Return the depth of the deepest overlap of two rings, or of a ring and the
-        ground, relative to the tubes' radius."""
+        """Return the depth of the deepest overlap between two rings, or between a ring
+        and the ground, relative to the radius of the tubes."""
         pairs = _near_pairs(self.positions, self.ring + self.tube)
         contacts = _Contacts.of(
             self.positions, rotation_from_quaternion(self.quaternions), self.ring, self.tube, pairs
@@ -116,7 +120,7 @@ class Pile:
         return float((contacts.depth / self.tube[contacts.first]).max(initial=0.0))
 
     def _pairs_within(self, seconds: float) -> tuple[Ints, Ints]:
-        """Return the pairs that may touch within that time."""
+        """Return the pairs of rings that may touch within ``seconds``."""
         reach = self.ring + self.tube
         speed = np.sqrt((self._velocities**2).sum(axis=1)) + reach * np.sqrt(
             (self._spins**2).sum(axis=1)
@@ -147,8 +151,8 @@ class Pile:
     def _separate(
         self, contacts: _Contacts, rotations: Floats, before: Floats, turned_before: Floats
     ) -> npt.NDArray[np.bool_]:
-        """Separate touching bodies and reduce their sliding, all contacts together;
-        return which bodies touch."""
+        """Separate overlapping bodies and reduce their sliding, for all contacts
+        together; return (N,) which bodies touch."""
         first, second, ground = contacts.first, contacts.second, contacts.second < 0
         other = np.where(ground, first, second)
         arm_a = contacts.point - self.positions[first]
@@ -156,7 +160,7 @@ class Pile:
         old = rotation_from_quaternion(turned_before)
 
         def moved(body: Ints, arm: Floats) -> Floats:
-            """Return how far the body's material at the contact has moved in this
+            """Return how far the bodies' material at the contacts has moved in this
             substep."""
             local = np.einsum("nji,nj->ni", rotations[body], arm)
             was = before[body] + np.einsum("nij,nj->ni", old[body], local)
@@ -193,27 +197,28 @@ class Pile:
                 shift[:, axis] += np.bincount(body, self._lightness[body] * share[:, axis], count)
                 turn[:, axis] += np.bincount(body, twist[:, axis], count)
             touching += np.bincount(body, share.any(axis=1), count)
-        # Contacts that push in the same direction would together push too far; their
-        # mean would converge too slowly.
+        # The sum of corrections by contacts that push in the same direction would be
+        # too large, and their mean would converge too slowly. So the sum is divided by
+        # the root of their number.
         weight = _RELAX / np.maximum(np.sqrt(touching), 1)
         self.positions += weight[:, None] * shift
         self.quaternions = _turned(self.quaternions, weight[:, None] * turn)
         return touching > 0
 
     def _give(self, body: Ints, arm: Floats, direction: Floats, rotations: Floats) -> Floats:
-        """Return how far a unit impulse at the end of the arm moves that end."""
+        """Return how far the end of each arm moves if a unit impulse acts on it."""
         local = np.einsum("nji,nj->ni", rotations[body], np.cross(arm, direction))
         return np.asarray(self._lightness[body] + np.sum(self._ease[body] * local**2, axis=1))
 
 
 @dataclass
 class _Contacts:
-    """C positions where bodies overlap."""
+    """C contacts, where bodies overlap."""
 
     first: Ints  # (C,)
-    second: Ints  # (C,) -1: the ground
-    point: Floats  # (C,3) in the middle of the overlap
-    normal: Floats  # (C,3) unit, from the second body to the first
+    second: Ints  # (C,) -1 is the ground
+    point: Floats  # (C,3) positions in the middle of the overlap
+    normal: Floats  # (C,3) unit vectors from the second body to the first
     depth: Floats  # (C,) > 0
 
     @staticmethod
@@ -243,8 +248,8 @@ class _Contacts:
             away = on_a - on_b
             distance = np.sqrt((away**2).sum(axis=-1))
             depth = (tube[a] + tube[b])[:, None] - distance
-            # Two rings may touch at two points: the deepest one, and the deepest one
-            # elsewhere.
+            # Two rings may touch at two points: at the deepest point, and at the
+            # deepest point far from it.
             row = np.arange(len(a))
             deepest = depth.argmax(axis=1)
             elsewhere = ((on_a - on_a[row, deepest][:, None]) ** 2).sum(axis=-1) > (ring[a] ** 2)[
@@ -266,11 +271,11 @@ class _Contacts:
 def _nearest_on_rings(
     positions: Floats, rotations: Floats, ring: Floats, a: Ints, b: Ints
 ) -> tuple[Floats, Floats]:
-    """Return the closest points of the circles of pairs, from several starts, (P,S,3)
-    on each."""
+    """Return the closest points of the circles of pairs, (P,S,3) on each circle, from S
+    starting points."""
 
     def onto(points: Floats, body: Ints) -> Floats:
-        """Return the closest points of the bodies' circles."""
+        """Return the points on the bodies' circles that are closest to `points`."""
         axis = rotations[body][:, None, :, 2]
         offset = points - positions[body][:, None]
         offset = offset - axis * (offset * axis).sum(axis=-1, keepdims=True)
@@ -289,8 +294,8 @@ def _nearest_on_rings(
 
 
 def _near_pairs(positions: Floats, reach: Floats) -> tuple[Ints, Ints]:
-    """Return pairs a < b of overlapping balls, found on a grid with cells as wide as
-    the largest ball."""
+    """Return pairs a < b of overlapping balls. The search uses a grid with cells as
+    wide as the largest ball."""
     if not len(positions):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     width = 2 * float(reach.max())
@@ -304,7 +309,7 @@ def _near_pairs(positions: Floats, reach: Floats) -> tuple[Ints, Ints]:
     for dx, dy, dz in np.ndindex(3, 3, 3):
         step = ((dx - 1) * size[1] + dy - 1) * size[2] + dz - 1
         if step < 0:
-            continue  # found from the other side
+            continue  # this pair of cells is found from the other cell
         begin, end = (np.searchsorted(ordered, key + step, side=s) for s in ("left", "right"))
         count = end - begin
         first = np.repeat(np.arange(len(key)), count)
@@ -320,8 +325,7 @@ def _near_pairs(positions: Floats, reach: Floats) -> tuple[Ints, Ints]:
 
 
 def _turned(quaternions: Floats, rotation_vectors: Floats) -> Floats:
-    """Return quaternions after small further rotations, given as vectors in the
-    world."""
+    """Return quaternions after additional small rotations by vectors in world space."""
     w, v = quaternions[:, :1], quaternions[:, 1:]
     r = 0.5 * rotation_vectors
     result = np.concatenate(
@@ -331,7 +335,8 @@ def _turned(quaternions: Floats, rotation_vectors: Floats) -> Floats:
 
 
 def _rotation_vector(after: Floats, before: Floats) -> Floats:
-    """Return the small rotation from one to the other, as a vector in the world."""
+    """Return the small rotation from `before` to `after`, as a vector in world
+    space."""
     w0, v0, w1, v1 = before[:, :1], before[:, 1:], after[:, :1], after[:, 1:]
     scalar = w1 * w0 + (v1 * v0).sum(axis=1, keepdims=True)
     vector = w0 * v1 - w1 * v0 - np.cross(v1, v0)

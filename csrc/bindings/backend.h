@@ -254,7 +254,7 @@ class Backend {
 
     // Waits, because `leaf_offset` is in host memory.
     virtual void median_split(Span<const Point> points, Span<const int64_t> offset, int depth,
-                              Span<int64_t> order, Span<int64_t> leaf_offset,
+                              size_t unit, Span<int64_t> order, Span<int64_t> leaf_offset,
                               const Work& work) const = 0;
     virtual void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                                Span<Ball> out, const Work& work) const = 0;

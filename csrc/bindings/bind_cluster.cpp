@@ -27,7 +27,7 @@ void check_finite(Span<const float> means) {
                                   " in row " + std::to_string(i / 3));
 }
 
-py::tuple median_split(const py::object& means, const py::array& offset, int depth) {
+py::tuple median_split(const py::object& means, const py::array& offset, int depth, int64_t unit) {
     constexpr int kDeepest = 32;  // splits up to 2^32 points
     const Device device = device_of(means, "means");
     const Span<const float> values = span_on<const float>(device, means, "means", {-1, 3});
@@ -38,6 +38,7 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
     const Span<const int64_t> offsets = offsets_of(offset, points.size);
     if (depth < 0 || depth > kDeepest)
         throw py::value_error("depth: expected 0 to 32, got " + std::to_string(depth));
+    if (unit < 1) throw py::value_error("unit: expected at least 1, got " + std::to_string(unit));
     const Work work(device);
     if (work.backend().traits.host_reads_arrays) check_finite(values);
     const NewArray<int64_t> order(device, {static_cast<py::ssize_t>(points.size)});
@@ -45,7 +46,8 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
         {}, {static_cast<py::ssize_t>(((offsets.size - 1) << depth) + 1)});
     {
         const Unlocked unlocked;
-        work.backend().median_split(points, offsets, depth, order.span, leaf_offset.span, work);
+        work.backend().median_split(points, offsets, depth, static_cast<size_t>(unit), order.span,
+                                    leaf_offset.span, work);
     }
     return py::make_tuple(order.object, leaf_offset.object);
 }
@@ -164,9 +166,10 @@ void bind_cluster(py::module_& m) {
           "that can be drawn.");
     m.def("num_halvings", &halvings, "count"_a, "cluster_size"_a,
           "Returns how often points are halved until no part has more than cluster_size.");
-    m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a,
+    m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a, "unit"_a = 1,
           "Sorts the points of each segment into the leaves of a perfect binary tree: returns "
-          "order (N,) int64, and leaf_offset (L + 1,) int64 on the host.");
+          "order (N,) int64, and leaf_offset (L + 1,) int64 on the host. The left part of a node "
+          "has half of its points, rounded up to a multiple of unit.");
     m.def("morton_order", &order_along_curve, "means"_a,
           "Returns the order (N,) of points on the host along a Morton curve, which keeps "
           "neighbours together.");

@@ -191,10 +191,10 @@ class CudaBackend final : public Backend {
             cudaGetLastError();
     }
 
-    void median_split(Span<const Point> points, Span<const int64_t> offset, int depth,
+    void median_split(Span<const Point> points, Span<const int64_t> offset, int depth, size_t unit,
                       Span<int64_t> order, Span<int64_t> leaf_offset,
                       const Work& work) const override {
-        cuda::median_split(points, offset, depth, order, leaf_offset, stream_of(work));
+        cuda::median_split(points, offset, depth, unit, order, leaf_offset, stream_of(work));
     }
     void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                        Span<Ball> out, const Work& work) const override {

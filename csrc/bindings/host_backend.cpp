@@ -99,9 +99,9 @@ class HostBackend final : public Backend {
     Entered enter(Device) const override { return {.device_before = 0, .stream = nullptr}; }
     void leave(Device, int) const noexcept override {}
 
-    void median_split(Span<const Point> points, Span<const int64_t> offset, int depth,
+    void median_split(Span<const Point> points, Span<const int64_t> offset, int depth, size_t unit,
                       Span<int64_t> order, Span<int64_t> leaf_offset, const Work&) const override {
-        cpu::median_split(points, offset, depth, order, leaf_offset);
+        cpu::median_split(points, offset, depth, unit, order, leaf_offset);
     }
     void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                        Span<Ball> out, const Work&) const override {

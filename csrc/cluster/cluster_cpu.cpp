@@ -14,18 +14,19 @@ namespace v3dg {
 
 int num_halvings(size_t n, size_t cluster_size) {
     int depth = 0;
-    for (size_t largest = n; largest > cluster_size; largest = (largest + 1) / 2) ++depth;
+    for (size_t largest = n; largest > cluster_size; largest = left_half(largest, 1)) ++depth;
     return depth;
 }
 
-void halve_segments(Span<const int64_t> offset, int depth, Span<int64_t> leaf_offset) {
+void halve_segments(Span<const int64_t> offset, int depth, size_t unit, Span<int64_t> leaf_offset) {
     const size_t leaves = size_t(1) << depth;
     assert(leaf_offset.size == (offset.size - 1) * leaves + 1);
     for (size_t s = 0; s < offset.size; ++s) leaf_offset[s * leaves] = offset[s];
     for (size_t width = leaves; width > 1; width /= 2)
         for (size_t leaf = 0; leaf + 1 < leaf_offset.size; leaf += width) {
             const int64_t first = leaf_offset[leaf], last = leaf_offset[leaf + width];
-            leaf_offset[leaf + width / 2] = first + (last - first + 1) / 2;
+            leaf_offset[leaf + width / 2] =
+                first + static_cast<int64_t>(left_half(static_cast<size_t>(last - first), unit));
         }
 }
 
@@ -62,21 +63,23 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
 // Splits points `first` to `last` into the 2^depth leaves of a node. All arguments are
 // plain values: LLVM's OpenMP, which the thread sanitizer requires (.ci/sanitize), does
 // not copy other types into a task that runs immediately.
-void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, int64_t* order) {
+void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, size_t unit,
+                int64_t* order) {
     if (depth == 0) {
         for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
         std::sort(order + first, order + last);
         return;
     }
-    const ptrdiff_t middle = first + (last - first + 1) / 2;
+    const ptrdiff_t middle =
+        first + static_cast<ptrdiff_t>(left_half(static_cast<size_t>(last - first), unit));
     if (middle < last) {
         const int axis = longest_axis(points + first, points + last);
         const auto move = axis == 0 ? move_median<0> : axis == 1 ? move_median<1> : move_median<2>;
         move(points + first, points + middle, points + last);
     }
 #pragma omp task if (last - first > kTaskSize)
-    split_node(points, first, middle, depth - 1, order);
-    split_node(points, middle, last, depth - 1, order);
+    split_node(points, first, middle, depth - 1, unit, order);
+    split_node(points, middle, last, depth - 1, unit, order);
 }
 
 size_t farthest(const Center& center, const Ball* spheres, size_t count, double* distance) {
@@ -134,10 +137,10 @@ Center center_of(const Ball* spheres, size_t count) {
 
 }  // namespace
 
-void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
+void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int depth, size_t unit,
                        Span<int64_t> order, Span<int64_t> leaf_offset) {
     assert(order.size == means.size);
-    halve_segments(offset, depth, leaf_offset);
+    halve_segments(offset, depth, unit, leaf_offset);
     std::vector<IndexedPoint> points(means.size);
     const ptrdiff_t count = static_cast<ptrdiff_t>(means.size);
     const ptrdiff_t num_segments = static_cast<ptrdiff_t>(offset.size) - 1;
@@ -148,7 +151,7 @@ void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int 
             points[i] = {{means[i].axis[0], means[i].axis[1], means[i].axis[2]}, uint32_t(i)};
 #pragma omp for schedule(dynamic, 1)
         for (ptrdiff_t s = 0; s < num_segments; ++s)
-            split_node(points.data(), offset[s], offset[s + 1], depth, order.data);
+            split_node(points.data(), offset[s], offset[s + 1], depth, unit, order.data);
     }
 }
 

@@ -21,6 +21,14 @@ constexpr double kNestingMargin = 4e-6;
 // The smallest radius of a ball. Squares of it are normal numbers, with full precision.
 constexpr float kMinRadius = 1e-15f;
 
+// Returns how many of a node's points its left half has: half of them, rounded up to a
+// multiple of `unit`, but not more than there are.
+constexpr size_t left_half(size_t num_points, size_t unit) {
+    const size_t num_units = (num_points + unit - 1) / unit;
+    const size_t left = (num_units + 1) / 2 * unit;
+    return left < num_points ? left : num_points;
+}
+
 struct Center {
     double x, y, z;
 };

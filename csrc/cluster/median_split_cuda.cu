@@ -228,9 +228,9 @@ void sort_lists(const Point* means, size_t count, const Node* segments, uint32_t
 
 }  // namespace
 
-void median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
+void median_split(Span<const Point> means, Span<const int64_t> offset, int depth, size_t unit,
                   Span<int64_t> order, Span<int64_t> leaf_offset, Stream stream) {
-    halve_segments(offset, depth, leaf_offset);
+    halve_segments(offset, depth, unit, leaf_offset);
     const size_t count = means.size;
     if (count == 0) return;
     const unsigned blocks = blocks_for(count, kBlockSize);

@@ -731,7 +731,7 @@ def test_film_of_a_path_is_saved(tab, tmp_path):
 def test_camera_goes_to_one_of_the_file_and_back(tab):
     first = tab.settled()
     tab.open("Cameras of the file")
-    tab.page.get_by_label("Of the file").select_option("from the side")
+    tab.page.get_by_label("Camera", exact=True).select_option("from the side")
     tab.page.wait_for_timeout(900)
     aside = tab.settled()
     assert differ(first, aside) > 0.02

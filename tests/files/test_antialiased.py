@@ -138,9 +138,9 @@ SOG = {
     "another model": (
         {"antialias": True, "model": "x"},
         True,
-        ('The model "x" is not known and was left out.',),
+        ('The model "x" is unknown and was ignored.',),
     ),
-    "other fields": ({"author": 3}, None, ("Fields of meta.json were left out: 'author'.",)),
+    "other fields": ({"author": 3}, None, ("Fields of meta.json were ignored: 'author'.",)),
 }
 
 
@@ -186,7 +186,7 @@ def test_flags_of_spz_that_are_not_known_are_told(tmp_path):
     (tmp_path / "a.spz").write_bytes(content)
     found = open_asset(tmp_path / "a.spz").declared
     assert found.antialiased is True
-    assert "Its flags 0x40 are unknown, and are not read." in found.notes
+    assert "Its flags 0x40 are unknown and were ignored." in found.notes
 
 
 def test_what_is_made_of_gaussians_keeps_it():
@@ -259,7 +259,7 @@ def test_a_bundle_has_it_from_the_asset(tmp_path, antialiased):
 def test_settings_win_over_the_asset_and_the_contradiction_is_told(antialiased):
     asset = ASSET.trained(antialiased=not antialiased)
     config = replace(FAST, asset_antialiased=antialiased, asset_filter_px2=0.1)
-    with pytest.warns(AssetWarning, match="It says that it was trained with"):
+    with pytest.warns(AssetWarning, match="asset: declared as trained with"):
         bundle = build_bundle(asset, config=config, progress=False, device="cpu")
     assert look_of(bundle) == ({np.float32(0.1).item()}, {int(antialiased)})
     with warnings.catch_warnings():
@@ -322,7 +322,7 @@ def test_commands_say_it_once(tmp_path):
     ]
     texts = [process.stdout + process.stderr for process in done]
     assert [text.count("trained with antialiasing") for text in texts] == [1] * len(texts)
-    assert "but is built without" in texts[-1]
+    assert "asset_antialiased=False" in texts[-1]
 
 
 def test_convert_says_once_what_is_not_read(tmp_path):
@@ -331,7 +331,7 @@ def test_convert_says_once_what_is_not_read(tmp_path):
     for name, part in content.items():
         (tmp_path / name).write_bytes(part)
     done = run("convert", tmp_path / "meta.json", tmp_path / "a.ply")
-    assert done.stderr.count("Fields of meta.json were left out: 'fog'.") == 1
+    assert done.stderr.count("Fields of meta.json were ignored: 'fog'.") == 1
 
 
 def test_commands_keep_it(tmp_path):

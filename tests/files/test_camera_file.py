@@ -70,7 +70,7 @@ def test_a_synthetic_scene_is_read(tmp_path):
         assert camera.fx == camera.fy == pytest.approx(400 / math.tan(0.345))
         assert (camera.cx, camera.cy, camera.width, camera.height) == (400, 300, 800, 600)
     with pytest.raises(
-        ValueError, match=r"frames\[0\]: expected w and h, .* got neither; give the size"
+        ValueError, match=r"frames\[0\]: expected w and h, .* got neither; pass the size"
     ):
         read_cameras(path)
 
@@ -353,7 +353,9 @@ def without_size():
 
 
 def test_a_path_without_a_size_needs_one(tmp_path):
-    with pytest.raises(ValueError, match="expected render_width and render_height; give the s"):
+    with pytest.raises(
+        ValueError, match="expected render_width and render_height, got neither; pass the s"
+    ):
         read_cameras(put(tmp_path, without_size()))
     camera = read_cameras(put(tmp_path, without_size()), size=(64, 48))["0"]
     assert (camera.width, camera.height) == (64, 48)
@@ -390,7 +392,7 @@ OTHER_FILES = {
     ),
     "poses without lenses": (
         [{"file_path": "a.png", "transform": MATRIX[:3]}],
-        "[0]: expected position, rotation, fx and fy, got a pose alone, as ns-export",
+        "[0]: expected position, rotation, fx and fy, got only a pose, as written by ns-export",
     ),
     "a camera of 3DGS without a rotation": (
         [{"position": [0, 0, 0], "fx": 1, "fy": 1, "width": 8, "height": 8}],
@@ -419,5 +421,5 @@ def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert list(read_cameras(path)) == list(wanted)
     path.write_bytes(json.dumps(CAPTURE).encode("utf-16"))
-    with pytest.raises(ValueError, match="does not parse: it is in UTF-16; save it as UTF-8"):
+    with pytest.raises(ValueError, match="does not parse: the file is in UTF-16; save it as UTF-8"):
         read_cameras(path)

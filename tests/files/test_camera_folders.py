@@ -237,17 +237,17 @@ TEXTS = {
     ),
     "an image without a camera": (
         "1 1 0 0 0 0 0 0 7 a.jpg\n\n",
-        "expected image 1 with a camera of cameras.txt, got 7",
+        "expected a camera of image 1 that cameras.txt contains, got camera 7",
     ),
     "an image twice": (
         "1 1 0 0 0 0 0 0 1 a.jpg\n\n1 1 0 0 0 0 0 0 1 b.jpg\n\n",
-        "expected each image once, got 1 twice",
+        "expected distinct image ids, got 1 twice",
     ),
     "too few numbers": ("1 1 0 0\n\n", "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME in"),
     "no rotation": ("1 0 0 0 0 0 0 0 1 a.jpg\n\n", "a.jpg: expected a camera, got viewmat: expe"),
     "no finite number": (
         "1 nan 0 0 0 0 0 0 1 a.jpg\n\n",
-        "expected an image with finite numbers, got none: 1 of 1 images have cameras whose",
+        "expected at least one image with finite numbers, got none: 1 of 1 images have",
     ),
     "no number": ("1 one 0 0 0 0 0 0 1 a.jpg\n\n", "expected IMAGE_ID QW QX QY QZ TX TY TZ CAM"),
 }
@@ -276,7 +276,7 @@ def test_only_images_without_finite_numbers_are_left_out(tmp_path, text, place):
         f"1 1 0 0 0 0 0 0 1 a b.jpg\n\n2 1 {numbers['pose']} 0 0 0 0 0 2 c d.jpg\n\n"
         "3 1 0 0 0 0 0 5 1 e.jpg\n\n"
     )
-    message = r"images.txt: 1 of 3 images have cameras .* not finite and are left out: c d\.jpg"
+    message = r"images.txt: 1 of 3 images have cameras .* not finite and are skipped: c d\.jpg"
     with pytest.warns(CameraWarning, match=message):
         assert list(read_cameras(tmp_path)) == ["a b.jpg", "e.jpg"]
 
@@ -375,11 +375,11 @@ def test_a_run_without_its_data_is_refused(trained, tmp_path):
     run, _ = trained
     (tmp_path / "data" / "poster" / "transforms.json").unlink()
     with pytest.raises(
-        ValueError, match=r"config\.yml: expected the run's data at data/poster/tran"
+        ValueError, match=r"config\.yml: expected the data of the run at data/poster/tran"
     ):
         read_cameras(run)
     (run / "config.yml").write_text("data: null\n")
-    with pytest.raises(ValueError, match="a path under data:, which it has not, got none"):
+    with pytest.raises(ValueError, match="a path under data:, which is missing, got no file"):
         read_cameras(run)
 
 

@@ -184,22 +184,22 @@ def test_a_leaf_without_its_finest_level_has_the_next(tmp_path, bundle):
         ({"version": 2}, "version: expected streamed SOG version 1, got 2"),
         (
             {"filenames": ["/etc/passwd"] * 9},
-            "filenames[0]: expected a path below that of lod-meta.json",
+            "filenames[0]: expected a path inside the folder of lod-meta.json",
         ),
         (
             {"filenames": ["../a/meta.json"] * 9},
-            "filenames[0]: expected a path below that of lod-meta.json",
+            "filenames[0]: expected a path inside the folder of lod-meta.json",
         ),
         ({"filenames": []}, "tree.lods.0.file: expected 0 to -1, got 0"),
         (
             {"environment": "../meta.json"},
-            "environment: expected a path below that of lod-meta.json",
+            "environment: expected a path inside the folder of lod-meta.json",
         ),
-        ({"offset": 1}, "gaussians of '0_0/meta.json', got more"),
+        ({"offset": 1}, "gaussians from '0_0/meta.json', got more"),
         ({"offset": -1}, "tree.lods.0.offset: expected a whole number, 0 or more, got -1"),
         ({"offset": 10**30}, "tree.lods.0.offset: expected a whole number"),
-        ({"tree": {}}, "expected gaussians in the tree, got none"),
-        ({"tree": {"lods": {"x": {}}}}, "tree.lods: expected levels by number"),
+        ({"tree": {}}, "expected at least one gaussian in the tree, got none"),
+        ({"tree": {"lods": {"x": {}}}}, "tree.lods: expected levels with integers as names"),
         ({"tree": {"children": [[]]}}, "tree.children[0]: expected an object, got []"),
     ],
 )
@@ -361,15 +361,17 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
     (tmp_path / "file").touch()
     for name in ("mine", "file"):
         with pytest.raises(
-            ValueError, match=f"{name}: expected a new folder, or one with an earlier export"
+            ValueError, match=f"{name}: expected a new folder or one with an earlier export"
         ):
             write_streamed_sog(bundle, tmp_path / name)
     with pytest.raises(
         ValueError,
-        match=r"chunk: expected at least \d+ gaussians, the size of a group of the asset, got 9",
+        match=r"chunk: expected at least \d+ gaussians, the size of the largest group, got 9",
     ):
         write_streamed_sog(bundle, tmp_path / "web", chunk=9)
-    with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):
+    with pytest.raises(
+        ValueError, match="bundle: expected at least one gaussian to export, got none"
+    ):
         write_streamed_sog(random_bundle(num_levels=0), tmp_path / "web")
     with pytest.raises(ValueError, match="chunk: expected at least"):
         write_streamed_sog(bundle, tmp_path / "absent" / "web", chunk=9)

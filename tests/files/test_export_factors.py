@@ -38,7 +38,9 @@ WRITERS = pytest.mark.parametrize("write", [write_usd, write_tiles, write_site])
 
 @WRITERS
 def test_left_out_factors_are_told(write, tmp_path):
-    with pytest.warns(ExportWarning, match="cannot hold the opacity and tint.*those of 2 are left"):
+    with pytest.warns(
+        ExportWarning, match="cannot store the opacity and tint.*those of 2 instances are left"
+    ):
         write(scene(opacity=[1, 0.5, 1], tint=[(1, 1, 1), (1, 1, 1), (1, 0, 1)]), tmp_path)
 
 

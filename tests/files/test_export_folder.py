@@ -67,7 +67,7 @@ def test_a_folder_without_a_record_is_refused_and_stays(tmp_path, bundle, write)
     folder = project(tmp_path / "project")
     before = contents(folder)
     with pytest.raises(
-        ValueError, match="project: expected a new folder, or one with an earlier export, got"
+        ValueError, match="project: expected a new folder or one with an earlier export, got"
     ):
         write(bundle, folder)
     assert contents(folder) == before
@@ -91,7 +91,7 @@ def test_files_that_are_read_are_not_written_around(tmp_path, bundle, write):
     for output in (folder, tmp_path, tmp_path / "link", Path("/")):
         for overwrite in (False, True):
             with pytest.raises(
-                ValueError, match=r"the input .*a\.v3dg is in it; choose another folder"
+                ValueError, match=r"contains the input .*a\.v3dg; choose another folder"
             ):
                 write(bundle, output, overwrite=overwrite)
     assert contents(folder) == before
@@ -109,7 +109,7 @@ def test_the_command_refuses_a_folder_with_what_it_reads(tmp_path, bundle):
         for more in ((), ("--overwrite",), ("--to", "tiles")):
             fails(
                 1,
-                f"{name} is in it",
+                f"contains the input {name}",
                 "export",
                 name,
                 "-o",
@@ -119,14 +119,14 @@ def test_the_command_refuses_a_folder_with_what_it_reads(tmp_path, bundle):
                 cwd=cwd,
             )
         assert contents(tmp_path) == before
-    with pytest.raises(ValueError, match=r"town\.json is in it"):
+    with pytest.raises(ValueError, match=r"contains the input .*town\.json"):
         write_site(tmp_path / "town" / "town.json", tmp_path / "town", overwrite=True)
 
 
 def test_the_command_overwrites_when_it_is_told_to(tmp_path, bundle):
     project(tmp_path / "project")
     arguments = ("export", "data/a.v3dg", "-o", "project", "--quiet")
-    fails(1, "choose another, or overwrite", *arguments, cwd=tmp_path)
+    fails(1, "choose another folder, or overwrite", *arguments, cwd=tmp_path)
     done = run(*arguments, "--overwrite", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "project" / "thesis.tex").read_text() == "my thesis.tex"
@@ -277,7 +277,8 @@ def test_a_record_that_names_what_no_export_writes_is_refused(tmp_path, bundle, 
     before = contents(tmp_path)
     for overwrite in (False, True):
         with pytest.raises(
-            ValueError, match=rf"{RECORD}: {field}.*: expected a name that an export writes"
+            ValueError,
+            match=rf"{RECORD}: {field}.*: expected the name of a file that an export writes",
         ):
             write_tiles(bundle, folder, overwrite=overwrite)
     assert contents(tmp_path) == before

@@ -142,7 +142,7 @@ def test_bad_input_is_named_and_nothing_is_left(place):
     fails(1, "expected a file ending in", "export", "town.txt", cwd=place)
     fails(
         1,
-        "got an asset; build a bundle from it: v3dg build asset.ply",
+        "got an asset; build a bundle from it with v3dg build asset.ply",
         "export",
         "asset.ply",
         cwd=place,
@@ -150,10 +150,14 @@ def test_bad_input_is_named_and_nothing_is_left(place):
     fails(
         1, "chunk: expected at least", "export", "a b1.v3dg", "-o", "x/y", "--chunk", "1", cwd=place
     )
-    with pytest.raises(ValueError, match="scene: expected instances to export, got none"):
+    with pytest.raises(
+        ValueError, match="scene: expected at least one instance to export, got none"
+    ):
         write_site(v3dg.Scene(), "site")
     scene, cameras = v3dg.read_scene("town.json")
-    with pytest.raises(TypeError, match=r"cameras: expected cameras by their names.*, got list"):
+    with pytest.raises(
+        TypeError, match=r"cameras: expected a mapping from names to cameras.*, got list"
+    ):
         write_site(scene, "site", list(cameras.values()))
     with pytest.raises(ValueError, match="up: expected 'x' or"):
         write_site(v3dg.Bundle.open("a b1.v3dg"), "site", up="up")

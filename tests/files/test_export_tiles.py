@@ -170,6 +170,8 @@ def test_the_command_says_how_to_look_at_tiles(tmp_path):
         "mine",
         cwd=tmp_path,
     )
-    with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):
+    with pytest.raises(
+        ValueError, match="bundle: expected at least one gaussian to export, got none"
+    ):
         write_tiles(random_bundle(num_levels=0), tmp_path / "none")
     assert sorted(os.listdir(tmp_path)) == ["a.v3dg", "a_web", "mine"]

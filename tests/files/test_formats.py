@@ -480,7 +480,7 @@ HOSTILE_SPZ = {
     "no header": (spz()[:15], "expected a header of 16 bytes, got 15"),
     "huge count": (
         spz(count=2**32 - 1),
-        "expected a byte a gaussian beyond 262144, got 4294967295 gaussians in",
+        "at least one byte per gaussian after the first 262144, got 4294967295",
     ),
     "a long trailer": (
         spz() + bytes(2 << 20),
@@ -522,17 +522,17 @@ def test_extensions_after_the_gaussians_of_spz_are_told(tmp_path, content):
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        (15, 5, "expected a table of 6 streams after the header, got 5 at 32"),
-        (16, 31, "expected a table of 6 streams after the header, got 6 at 31"),
-        (19, 255, "expected a table of 6 streams after the header, got 6 at 42"),
+        (15, 5, "expected a table of 6 streams after the header, got one of 5 at offset 32"),
+        (16, 31, "expected a table of 6 streams after the header, got one of 6 at offset 31"),
+        (19, 255, "expected a table of 6 streams after the header, got one of 6 at offset 42"),
         (8, 65, "expected 585 bytes in stream 0, got 576"),
         (
             11,
             255,
-            "expected a byte a gaussian beyond 262144, got 4278190144 gaussians in 2635 bytes",
+            "at least one byte per gaussian after the first 262144, got 4278190144 gaussians",
         ),
-        (32 + 7, 255, "expected 576 bytes in stream 0, got 576 of"),
-        (4, 3, "expected version 3 in a gzip stream, got it outside of one"),
+        (32 + 7, 255, "expected 576 bytes in stream 0, got 576 (compressed"),
+        (4, 3, "expected version 4 without gzip, got version 3"),
         (128, 0, "expected a zstd stream that is not damaged, got zstd decompress error"),
     ],
 )
@@ -573,7 +573,7 @@ HOSTILE_SOG = {
     "version": (replaced('"version":2', '"version":3'), "version: expected SOG version 2, got 3"),
     "no version": (
         replaced('"version":2,', ""),
-        "expected SOG version 2, got an older file; convert it with",
+        "expected SOG version 2, got an older file; convert the file with",
     ),
     "count": (
         replaced('"count":300', '"count":-1'),
@@ -672,17 +672,21 @@ def test_splat_of_another_length_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        (0, 1, "expected .ksplat 0.1 or later and compression 0 to 2, got 1.1, 1"),
-        (20, 3, "expected .ksplat 0.1 or later and compression 0 to 2, got 0.1, 3"),
+        (0, 1, "expected .ksplat version 0.1 or later and compression 0 to 2, got version 1.1 and"),
+        (
+            20,
+            3,
+            "expected .ksplat version 0.1 or later and compression 0 to 2, got version 0.1 and",
+        ),
         (16, 0, "expected 256 gaussians in the sections, got 300"),
-        (4, 255, "expected headers of 255 sections, got 14496 bytes"),
+        (4, 255, "expected a file with headers of 255 sections, got one of 14496 bytes"),
         (4096 + 7, 255, "expected section 0 to end within 14496 bytes"),
         (4096 + 3, 255, "expected 300 gaussians in the sections, got 4278190380"),
         (4096 + 40, 3, "expected SH degree 0 to 2, got 3"),
         (4096 + 15, 255, "expected section 0 to end within 14496 bytes"),
         (4096 + 20, 11, "buckets in section 0"),
         (4096 + 34, 255, "buckets in section 0"),
-        (4096 + 3 * 1024, 99, "expected buckets for 100 gaussians in section 0, got fewer"),
+        (4096 + 3 * 1024, 99, "expected buckets for all 100 gaussians of section 0, got too few"),
     ],
 )
 def test_hostile_ksplat_is_refused(tmp_path, place, value, message):
@@ -706,7 +710,7 @@ HOSTILE_COMPRESSED_PLY = {
     "too few rows": (
         b"element vertex 300",
         b"element vertex 299",
-        "expected the end of the file after",
+        "expected a file that ends after",
     ),
     "huge count": (
         b"element vertex 300",
@@ -726,7 +730,7 @@ HOSTILE_COMPRESSED_PLY = {
     "a property twice": (
         b"packed_rotation",
         b"packed_scale",
-        "expected properties of element 'vertex', each once",
+        "expected properties of element 'vertex' with distinct names",
     ),
     "a list": (
         b"property uint packed_r",
@@ -792,7 +796,7 @@ def attribute(document, name):
 HOSTILE_GLB = {
     "no extension": (
         lambda d: d["meshes"][0]["primitives"][0].pop("extensions"),
-        "expected a primitive with KHR_gaussian_splatting, got none; meshes are not read",
+        "expected a primitive with KHR_gaussian_splatting, got none; surfaces cannot be read",
     ),
     "no attribute": (
         lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SCALE"),
@@ -818,11 +822,11 @@ HOSTILE_GLB = {
     ),
     "too many": (
         lambda d: [accessor.update(count=1 << 40) for accessor in d["accessors"]],
-        "a byte a gaussian beyond 262144",
+        "at least one byte per gaussian after the first 262144",
     ),
     "beyond its view": (
         lambda d: [accessor.update(count=65) for accessor in d["accessors"]],
-        "expected 65 values in its view, got 768 bytes",
+        "expected 65 elements in its buffer view, got one of 768 bytes",
     ),
     "beyond the file": (
         lambda d: d["bufferViews"][0].update(byteOffset=1 << 20),
@@ -836,7 +840,7 @@ HOSTILE_GLB = {
                 ]
             }
         ),
-        "expected scales of 0 or more, got less; drafts of the extension had their logs",
+        "expected scales of at least 0, got negative ones; drafts of the extension stored log",
     ),
 }
 
@@ -895,7 +899,7 @@ def test_leaves_of_h3dg_are_read(tmp_path, half):
 
 
 HOSTILE_HIER = {
-    "nothing": (lambda _: b"", "expected a number of gaussians, got 0 bytes"),
+    "nothing": (lambda _: b"", "expected a file of at least 4 bytes, got 0"),
     "many gaussians": (
         lambda c: struct.pack("<i", 2**31 - 1) + c[4:],
         "expected 2147483647 gaussians, got",
@@ -903,11 +907,11 @@ HOSTILE_HIER = {
     "cut off": (lambda c: c[:1000], "expected 71 gaussians, got 1000 bytes"),
     "many nodes": (
         lambda c: c[: 4 + 71 * 236] + struct.pack("<i", 2**31 - 1) + c[8 + 71 * 236 :],
-        "expected 2147483647 nodes and no more, got",
+        "expected exactly 2147483647 nodes, got",
     ),
     "leaves elsewhere": (
         lambda c: c[: 8 + 71 * 236 + 8] + struct.pack("<ii", 71, 1) + c[8 + 71 * 236 + 16 :],
-        "expected leaves among 71 gaussians, got others",
+        "expected nodes whose leaves are among the 71 gaussians, got others",
     ),
 }
 
@@ -1014,7 +1018,7 @@ def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
     torch.save(content, tmp_path / "step-000029999.ckpt")
     assert_same(read_quietly(tmp_path / "step-000029999.ckpt"), asset)
     notes = open_asset(tmp_path / "step-000029999.ckpt").declared.notes
-    wanted = ["Cameras were moved in training (camera_optimizer), so those of the data are not"]
+    wanted = ["Training moved the cameras (camera_optimizer), so those of the data set do not"]
     if degree == 0:
         wanted.append("Colours are stored as logits without view dependence, and were read as")
     assert [note[: len(text)] for note, text in zip(notes, wanted, strict=True)] == wanted
@@ -1029,8 +1033,8 @@ def test_checkpoints_of_older_splatfacto_are_read(tmp_path):
     torch.save({"pipeline": pipeline | grids}, tmp_path / "a.ckpt")
     assert_same(read_quietly(tmp_path / "a.ckpt"), asset)
     first, second = open_asset(tmp_path / "a.ckpt").declared.notes
-    assert first.startswith("The bilateral grids of single photographs were left out")
-    assert second == "Parts of the checkpoint were left out: 'new_net'."
+    assert first.startswith("The bilateral grids of single photographs are ignored")
+    assert second == "Parts of the checkpoint were ignored: 'new_net'."
 
 
 def test_colours_of_a_gsplat_with_appearance_are_those_without_it(tmp_path):
@@ -1046,8 +1050,10 @@ def test_colours_of_a_gsplat_with_appearance_are_those_without_it(tmp_path):
     file = open_asset(tmp_path / "a.pt")
     assert file.sh_degree == 0
     appearance, tensors_left_out, as_logits = file.declared.notes
-    assert appearance.startswith("The appearance of single photographs (app_module) was left out")
-    assert tensors_left_out == "Tensors of splats were left out: 'motion'."
+    assert appearance.startswith(
+        "The appearance model of single photographs (app_module) is ignored"
+    )
+    assert tensors_left_out == "Tensors of splats were ignored: 'motion'."
     assert as_logits.startswith("Colours are stored as logits")
 
 
@@ -1127,7 +1133,7 @@ def test_settings_are_only_read_as_far_as_they_are_plain(tmp_path, monkeypatch):
     settings.write_bytes(b"antialiased: true\n" + b"#" * (1 << 20))
     declared = open_asset("a.pt").declared
     assert declared.antialiased is None
-    assert declared.notes == ("cfg.yml is too large to be that of a run and was not read.",)
+    assert declared.notes == ("cfg.yml is too large for the settings of a run and was ignored.",)
     settings.write_bytes(b"\xff\xfe\0antialiased: [true\nstrategy:\n  antialiased: true\n")
     assert open_asset("a.pt").declared.antialiased is None
 
@@ -1161,8 +1167,14 @@ def test_a_checkpoint_executes_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"means": None}, "expected a tensor of floats means in the checkpoint, got NoneType"),
-        ({"means": torch.zeros(2, 3, dtype=torch.int32)}, "expected a tensor of floats means"),
+        (
+            {"means": None},
+            "expected means in the checkpoint to be a tensor of floats, got NoneType",
+        ),
+        (
+            {"means": torch.zeros(2, 3, dtype=torch.int32)},
+            "expected means in the checkpoint to be a tensor of floats",
+        ),
         ({"quats": torch.zeros(2, 3)}, "expected quats of shape (2, 4), got (2, 3)"),
         ({"scales": torch.zeros(3, 3)}, "expected scales of shape (2, 3), got (3, 3)"),
         ({"shN": torch.zeros(2, 5, 3)}, "expected SH degree 0 to 3, got shN of shape (2, 5, 3)"),

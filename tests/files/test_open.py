@@ -128,7 +128,7 @@ def test_nothing_is_written_that_cannot_be_opened(bundle, tmp_path):
             write()
     for name in ("noname", "scene.txt", "meta.json"):
         with pytest.raises(
-            ValueError, match=rf"{name}: expected a file name ending in \.json, not meta"
+            ValueError, match=rf"{name}: expected a file name ending in \.json \(but not meta"
         ):
             scene.save(tmp_path / name)
     assert sorted(tmp_path.iterdir()) == before
@@ -139,7 +139,7 @@ def test_cameras_without_names_are_told_so(bundle, camera, tmp_path):
     scene = v3dg.Scene.of(v3dg.open(tmp_path / "a.v3dg"))
     for write in (v3dg.write_cameras, lambda path, cameras: scene.save(path, cameras)):
         with pytest.raises(
-            TypeError, match=r"^cameras: expected cameras by their names, .* got list"
+            TypeError, match=r"^cameras: expected a mapping from names to cameras, .* got list"
         ):
             write(tmp_path / "t.json", [camera])
         with pytest.raises(TypeError, match=r"cameras\['a'\]: expected a Camera, got NoneType"):

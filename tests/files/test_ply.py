@@ -497,7 +497,7 @@ HOSTILE = {
     ),
     "compressed": (
         header("element vertex 0", "property uint packed_position"),
-        "expected the elements chunk and vertex of a compressed .ply, got no chunk",
+        "expected the elements chunk and vertex of a compressed .ply, but chunk is missing",
     ),
     "list for a number": (
         header("element vertex 0", *("property list uchar float x", *vertex_lines(0)[2:])),

@@ -186,12 +186,12 @@ def changed(place, value, document=GOOD):
         (
             ["instances", 1, "quaternion"],
             [0, 0, 0, 0],
-            "instances[1].quaternion: expected a quaternion that",
+            "instances[1].quaternion: expected a nonzero quaternion",
         ),
         (
             ["instances", 1, "bundle"],
             "tree",
-            'instances[1].bundle: expected a name from bundles, got "tree"',
+            'instances[1].bundle: expected a name in bundles, got "tree"',
         ),
         (
             ["instances", 1, "position"],
@@ -208,7 +208,7 @@ def changed(place, value, document=GOOD):
         (["bundles"], ["a"], "bundles: expected an object, got"),
         (["bundles", "donut"], 3, "bundles.donut: expected a string, got 3"),
         (["format"], "gltf", 'format: expected "v3dg-scene", got "gltf"'),
-        (["version"], 2, "version: expected 1, which is what this build reads, got 2"),
+        (["version"], 2, "version: expected version 1, the only one that can be read, got 2"),
         (["version"], None, "top level: expected the field version"),
         (["cameras", 0, "width"], 0, "cameras[0].width: expected a positive whole number, got 0"),
         (

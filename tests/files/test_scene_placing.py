@@ -64,13 +64,19 @@ def test_factors_are_read(folder):
         ({"matrix": [[1]]}, "instances[0].matrix: expected 4 rows of 4 numbers"),
         ({}, "instances[0]: expected the field position"),
         ({"position": [0, 0, 0], "up": "w"}, "instances[0].up: expected 'x' or 'y'"),
-        ({"position": [0, 0, 0], "up": "z"}, "instances[0].up: expected y, which is up in this"),
-        ({"position": [0, 0, 0], "opacity": 2}, "instances[0].opacity: expected a number of 0 to"),
+        ({"position": [0, 0, 0], "up": "z"}, "instances[0].up: expected y, the up axis of"),
+        (
+            {"position": [0, 0, 0], "opacity": 2},
+            "instances[0].opacity: expected a number from 0 to",
+        ),
         ({"position": [0, 0, 0], "tint": [1, 1]}, "instances[0].tint: expected 3 numbers"),
-        ({"position": [0, 0, 0], "tint": [1, 1, -1]}, "instances[0].tint: expected 3 numbers of 0"),
+        (
+            {"position": [0, 0, 0], "tint": [1, 1, -1]},
+            "instances[0].tint: expected 3 numbers of at least 0",
+        ),
         (
             {"position": [0, 0, 0], "scene": "b"},
-            "instances[0]: expected either the field bundle or",
+            "instances[0]: expected exactly one of the fields bundle",
         ),
     ],
 )
@@ -136,7 +142,7 @@ def test_depth_and_number_of_instances_are_bounded(folder):
         inner = [{"scene": f"s{depth - 1}", "position": [0, 0, 0]}] * 10
         put(folder / f"s{depth}.json", *inner, scenes=[f"s{depth - 1}"])
     assert len(read_scene(folder / "s2.json")[0]) == 1000
-    with pytest.raises(ValueError, match="at most 16 scenes inside each other"):
+    with pytest.raises(ValueError, match="at most 16 nested scenes"):
         read_scene(folder / "s16.json")
 
 

@@ -98,13 +98,13 @@ def test_base_colours_stand_for_coefficients(tmp_path, kind, encoding):
     path = put(tmp_path / "a.ply", columns, encoding)
     assert_close(read(path), expected_gaussians(wanted))
     (note,) = open_asset(path).declared.notes
-    assert note == "Red, green and blue were read as base colours, because f_dc_0 is missing."
+    assert note == "Red, green and blue were read as base colours because f_dc_0 is missing."
 
 
 def test_floats_of_0_to_255_are_no_base_colours(tmp_path):
     columns = {name: c for name, c in random_columns(3, 0).items() if "f_dc" not in name}
     columns |= {name: np.full(3, 200, np.float32) for name in ("red", "green", "blue")}
-    with pytest.raises(ValueError, match="expected colours of 0 to 1 in properties of floats, got"):
+    with pytest.raises(ValueError, match="expected colours from 0 to 1 in float properties, got"):
         read(put(tmp_path / "a.ply", columns))
 
 
@@ -114,7 +114,7 @@ def test_coefficients_come_before_base_colours(tmp_path):
     path = put(tmp_path / "a.ply", columns | colors)
     assert_close(read(path), expected_gaussians(columns))
     assert open_asset(path).declared.notes == (
-        "Properties of vertex that no gaussian has were left out: 'red', 'green', 'blue'.",
+        "Properties of vertex that are unknown were ignored: 'red', 'green', 'blue'.",
     )
 
 
@@ -155,7 +155,7 @@ def test_coefficients_of_degree_4_are_left_out(tmp_path):
     assert_close(read(path), wanted)
     file = open_asset(path)
     assert file.sh_degree == 3
-    assert file.declared.notes == ("Coefficients of SH degree 4 were left out.",)
+    assert file.declared.notes == ("Coefficients of SH degree 4 were ignored.",)
 
 
 def test_what_no_gaussian_has_is_told(tmp_path):
@@ -169,9 +169,9 @@ def test_what_no_gaussian_has_is_told(tmp_path):
     properties, elements = open_asset(path).declared.notes
     names = ", ".join(f"'semantic_{i}'" for i in range(8))
     assert properties == (
-        f"Properties of vertex that no gaussian has were left out: {names} and 2 more."
+        f"Properties of vertex that are unknown were ignored: {names} and 2 more."
     )
-    assert elements == "Elements beside vertex were left out: 'delta_vertex_0'."
+    assert elements == "Elements other than vertex were ignored: 'delta_vertex_0'."
 
 
 @pytest.mark.parametrize("dtype", ["f2", "i8", "u8"])
@@ -207,7 +207,7 @@ def test_what_a_compressed_ply_has_besides_is_told(tmp_path):
     content = content.replace(b"end_header\n", extra, 1) + bytes(2)
     (tmp_path / "b.ply").write_bytes(content)
     assert open_asset(tmp_path / "b.ply").declared.notes == (
-        "Elements beside chunk, vertex and sh were left out: 'state'.",
+        "Elements other than chunk, vertex and sh were ignored: 'state'.",
     )
     found = read(tmp_path / "b.ply")
     np.testing.assert_array_equal(found.means, read(tmp_path / "a.compressed.ply").means)
@@ -234,8 +234,8 @@ SOG_FIELDS = {
     "splat-transform, not": ({"model": "default"}, False, []),
     "others": ({"antialias": True}, True, []),
     "2DGS": ({"model": "2dgs"}, None, ["The gaussians are those of 2DGS; they were read as f"]),
-    "a later one": ({"model": "cubes"}, None, ['The model "cubes" is not known and was left out.']),
-    "a camera": ({"camera": {"fov": 1}}, None, ["Fields of meta.json were left out: 'camera'."]),
+    "a later one": ({"model": "cubes"}, None, ['The model "cubes" is unknown and was ignored.']),
+    "a camera": ({"camera": {"fov": 1}}, None, ["Fields of meta.json were ignored: 'camera'."]),
 }
 
 
@@ -265,7 +265,7 @@ def test_a_sog_may_be_zipped_with_its_folder(tmp_path, folder):
     with pytest.raises(ValueError, match=r"expected one SOG in the zip, got several: '(donut|a)/"):
         read(twice)
     streamed = zipped(tmp_path / "c.sog", files | {"donut/lod-meta.json": b"{}"})
-    with pytest.raises(ValueError, match="got a streamed SOG; unpack it, and open its lod-meta"):
+    with pytest.raises(ValueError, match="got a streamed SOG; unpack the zip and open lod-meta"):
         read(streamed)
 
 
@@ -285,8 +285,8 @@ def test_a_streamed_sog_declares_what_its_folders_do(tmp_path):
         (tmp_path / "lod-meta.json").write_bytes(b"\xef\xbb\xbf" + json.dumps(document).encode())
         return open_asset(tmp_path / "lod-meta.json").declared
 
-    notes = ("Fields of meta.json were left out: 'x'.",)
-    notes += ("Fields of lod-meta.json were left out: 'camera'.",)
+    notes = ("Fields of meta.json were ignored: 'x'.",)
+    notes += ("Fields of lod-meta.json were ignored: 'camera'.",)
     assert declared([0, 1]).antialiased is True
     assert declared([0, 1]).notes == notes
     assert declared([0, 2]).antialiased is None
@@ -338,7 +338,7 @@ def test_misnamed_files_are_recognised(tmp_path, file, suffix):
         assert found.declared == wanted.declared
         return
     named = suffix.removeprefix(".compressed")
-    note = f"Its name ends in {named}, but it is a {own}, and was read as such."
+    note = f"The name ends in {named}, but the file is a {own}; it was read as such."
     assert found.declared.notes == (note, *wanted.declared.notes)
 
 
@@ -361,7 +361,7 @@ def test_a_splat_that_begins_like_a_ksplat_is_a_splat(tmp_path):
 @pytest.mark.parametrize("name", ["a.zip", "a.gz", "a", "a.bin"])
 def test_files_of_unknown_names_are_named_by_what_they_are(tmp_path, name):
     shutil.copyfile(FIXTURES / "sh3.sog", tmp_path / name)
-    with pytest.raises(ValueError, match=r"this is a \.sog, so let its name end so$"):
+    with pytest.raises(ValueError, match=r"this is a \.sog, so rename it to end in that$"):
         read(tmp_path / name)
     (tmp_path / name).write_bytes(gzip.compress(b"ply\nformat ascii 1.0\n"))
     with pytest.raises(ValueError, match=r"this is a gzip of a \.ply; unpack it$"):
@@ -378,7 +378,7 @@ def zip_of(*names):
 
 OTHERS = {
     "a web page": (b"\n<!DOCTYPE HTML><html>", "a web page; download the file itself"),
-    "a pointer": (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS in p"),
+    "a pointer": (b"version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer instead"),
     "a packed ply": (gzip.compress(b"ply\nformat ascii 1.0\n"), "a gzip of a .ply; unpack it"),
     "a zip of a ply": (zip_of("a/b.ply"), "a zip of 'a/b.ply'; unpack it"),
     "a zip of USD": (zip_of("a.usdc"), "a .usdz"),
@@ -386,7 +386,7 @@ OTHERS = {
     "an old checkpoint": (
         b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.", "a checkpoint of torch before 1.6; save",
     ),
-    "a bundle": (struct.pack("<Q", 300) + b'{"__metadata__":{}}', "a file of safetensors, as b"),
+    "a bundle": (struct.pack("<Q", 300) + b'{"__metadata__":{}}', "a file of safetensors"),
 }  # fmt: skip
 
 

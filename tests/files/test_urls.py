@@ -212,7 +212,7 @@ def test_what_changes_at_its_url_is_an_error_until_it_is_opened_again(
     bundle = v3dg.open(URL)
     if is_shorter:
         there.pipe_file("/in/many.v3dg", many.read_bytes()[:5000])
-        message = r"expected \d+ bytes at \d+, got \d+; it has changed, open it again"
+        message = r"expected \d+ bytes at offset \d+, got \d+; the file has changed, open it again"
     else:
         put(there, tmp_path, seed=1)
         message = "the hash does not match"
@@ -379,8 +379,8 @@ def test_commands_take_urls_and_write_into_the_working_folder(
             r"memory://in/none\.ply: there is no such file; check the address",
         ),
         ("nowhere://in/a.ply", "Protocol not known: nowhere"),
-        ("memory://in/scene.json", "expected a scene that is here, got a URL"),
-        ("memory://in/lod-meta.json", "got the URL of a file that names other files"),
+        ("memory://in/scene.json", "expected a scene on this machine, got a URL"),
+        ("memory://in/lod-meta.json", "got the URL of a file that refers to other files"),
         ("memory://in/a.txt", "memory://in/a.txt: expected a file ending in"),
     ],
 )
@@ -604,7 +604,7 @@ def redirecting(web, places):
 def test_no_public_server_sends_us_on_to_a_private_address(web, names, tmp_path, places):
     v3dg.write_asset(tmp_path / "b.ply", random_gaussians(np.random.default_rng(0), 300))
     redirecting(web, places)
-    message = r"/a\.ply: refused to go on from a public server to a private address"
+    message = r"/a\.ply: refused a redirect from a public server to a private address"
     with pytest.raises(PermissionError, match=message):
         v3dg.open(f"http://public.test:{web.server_port}/a.ply")
     assert web.sent == []
@@ -622,7 +622,7 @@ def test_a_name_that_becomes_private_is_refused(web, names, tmp_path):
     source = WebSource(fsspec.filesystem("http"), f"http://public.test:{web.server_port}/a.v3dg")
     names["public.test"] = ["127.0.0.2"]
     web.sent.clear()
-    with pytest.raises(Problem, match="refused to go on"):
+    with pytest.raises(Problem, match="refused a redirect"):
         source.read_parts([(0, 8)], lambda data, offset: None)
     assert web.sent == []
 
@@ -638,7 +638,7 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
         return next(answers)
 
     monkeypatch.setattr("v3dg._urls.http.resolve", resolve)
-    with pytest.raises(PermissionError, match="refused to go on"):
+    with pytest.raises(PermissionError, match="refused a redirect"):
         v3dg.open(f"http://public.test:{web.server_port}/a.v3dg")
     assert web.sent == []
 
@@ -650,7 +650,7 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
         (
             "status 401",
             PermissionError,
-            "the server answered 401 Unauthorized; check user, password",
+            "the server answered 401 Unauthorized; check the user, the password",
         ),
         ("status 403", PermissionError, "the server answered 403 Forbidden; "),
         ("status 404", FileNotFoundError, "the server answered 404 Not Found; check the address"),
@@ -671,28 +671,28 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
         (
             "redirects to a file",
             ConnectionError,
-            "the server redirects to something that is no web address",
+            "the server redirects to something other than a web address",
         ),
-        ("gzip bomb", ConnectionError, "expected the file uncompressed, got a compressed answer"),
+        ("gzip bomb", ConnectionError, "expected an uncompressed answer, got a compressed one"),
         ("404 without end", FileNotFoundError, "the server answered 404"),
         ("claims 4 TB, honest parts", ValueError, "size: expected "),
         ("part without end", ValueError, "expected at most 1024 bytes, got more"),
         (
             "part longer than asked",
             ValueError,
-            r"expected 1024 bytes at 0, got \d+; it has changed",
+            r"expected 1024 bytes at offset 0, got \d+; the file has changed",
         ),
         (
             "parts, then none",
             ConnectionError,
-            "the server gave parts of the file before and now does not",
+            "the server sent parts of the file before but no longer does",
         ),
         ("whole without end", ValueError, r"expected at most \d+ bytes, got more"),
         ("forged tables of 1 GB", ValueError, "clusters: expected at most 262144"),
         (
             "forged tables of 4 TB",
             ValueError,
-            "clusters: expected at most 39268534564 for its pages",
+            "clusters: expected at most 39268534564 clusters for the size of its pages",
         ),
         ("forged tables of 2 TB", ValueError, "tables: expected at most 1073741824 bytes at a URL"),
         ("unknown size without end", ValueError, "expected at most 1048576 bytes, got more"),
@@ -723,10 +723,10 @@ def test_hosts_that_are_not_there_are_errors_that_say_so(web, monkeypatch):
     web.shutdown()
     web.server_close()
     with pytest.raises(
-        ConnectionRefusedError, match="the connection was refused; check host and port"
+        ConnectionRefusedError, match="the connection was refused; check the host and the port"
     ):
         v3dg.open(f"{web.address}/a.ply")
-    with pytest.raises(ConnectionError, match="the name of the host is not known"):
+    with pytest.raises(ConnectionError, match="the name of the host is unknown"):
         v3dg.open("http://nowhere.invalid/a.ply")
 
 
@@ -739,7 +739,7 @@ def test_no_more_is_fetched_than_there_is_room_for(web, tmp_path, monkeypatch):
     v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 300))
     monkeypatch.setattr("v3dg._urls.opened._SPARE_BYTES", 1 << 60)
     with pytest.raises(
-        OSError, match=r"/a\.ply: no room for it in .*; set TMPDIR to a folder with more"
+        OSError, match=r"/a\.ply: no space for the file in .*; set TMPDIR to a folder with more"
     ):
         v3dg.open(f"{web.address}/a.ply")
     assert web.sent == []
@@ -754,7 +754,7 @@ def test_a_url_that_is_none_is_an_error_without_its_password(host):
 
 
 def test_a_chain_of_places_is_refused():
-    with pytest.raises(ValueError, match="got a chain of places; fetch the file"):
+    with pytest.raises(ValueError, match="got a chain of URLs with '::'; download the file"):
         v3dg.open("zip://a.zip::http://127.0.0.1:1/a.ply")
 
 
@@ -842,5 +842,7 @@ def test_a_gltf_at_a_url_has_its_buffers_inside(there, tmp_path):
     with open(tmp_path / "a.bin", "rb") as secret:
         for uri in ("a.bin", str(secret.fileno())):
             there.put_file(str(file.write(tmp_path / "a.gltf", uri)), f"/in/{uri}.gltf")
-            with pytest.raises(ValueError, match="got one that names others; fetch the folder"):
+            with pytest.raises(
+                ValueError, match="got one that refers to other files; download its folder"
+            ):
                 v3dg.open(f"memory://in/{uri}.gltf")

@@ -154,7 +154,9 @@ def test_bad_files_are_refused(tmp_path):
         v3dg.read_asset(tmp_path / "none.usda")
     with pytest.raises(ValueError, match=r"path: expected '\.usd' or"):
         write_usd(random_bundle(3), tmp_path / "a.usdx")
-    with pytest.raises(ValueError, match="scene: expected instances to export, got none"):
+    with pytest.raises(
+        ValueError, match="scene: expected at least one instance to export, got none"
+    ):
         write_usd(v3dg.Scene(), tmp_path / "none.usda")
 
 
@@ -350,19 +352,18 @@ def test_the_degree_of_harmonics_is_3_by_default(tmp_path):
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_array_equal(found.sh, np.zeros((2, 1, 3)))
-    assert notes[0] == (
-        f"32 values of {name} for 50 in /gaussians are too few, so the schema's default was used."
-    )
+    lengths = f"32 values of {name} for 50 in /gaussians"
+    assert notes[0] == f"{lengths} are too few, so the default of the schema was used."
     prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(2)
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_array_equal(found.sh, values[:18].reshape(2, 9, 3))
     assert notes == [
-        f"32 values of {name} for 18 in /gaussians are too many, so the last ones were left out."
+        f"32 values of {name} for 18 in /gaussians are too many, so the last values were ignored."
     ]
     prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(-1)
     stage.GetRootLayer().Save()
-    with pytest.raises(ValueError, match="got the SH degree -1 in /gaussians"):
+    with pytest.raises(ValueError, match="got an invalid SH degree, -1, in /gaussians"):
         v3dg.read_asset(tmp_path / "a.usda")
 
 
@@ -377,7 +378,7 @@ def test_coefficients_above_degree_3_are_left_out(tmp_path):
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_array_equal(found.sh, values.reshape(2, 25, 3)[:, :16])
-    assert notes == ["Coefficients above SH degree 3 were left out."]
+    assert notes == ["Coefficients above SH degree 3 were ignored."]
 
 
 def test_halves_stand_for_floats(tmp_path):
@@ -434,7 +435,9 @@ def test_what_is_not_drawn_is_left_out_and_told(tmp_path, change):
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_array_equal(found.means, asset.means)
     (note,) = notes
-    assert note.startswith("Prims that are invisible or not for drawing were left out: '/world/gr")
+    assert note.startswith(
+        "Prims that are invisible or not meant to be drawn were ignored: '/world/gr"
+    )
     stage.RemovePrim("/world/shown")
     stage.GetRootLayer().Save()
     with pytest.raises(ValueError, match=r"no ParticleField3DGaussianSplat. Prims that are invis"):
@@ -453,7 +456,7 @@ def test_values_that_change_with_time_are_those_of_the_first_time(tmp_path):
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_allclose(found.means, [[2, 2, 3], [5, 5, 6]])
-    assert notes == ["Values change with time, and were read at the first one."]
+    assert notes == ["Values change with time; the first ones were read."]
 
 
 def test_what_a_prim_says_besides_is_told(tmp_path):
@@ -469,10 +472,10 @@ def test_what_a_prim_says_besides_is_told(tmp_path):
     stage.GetRootLayer().Save()
     _, notes = read_with_notes(tmp_path / "a.usda")
     assert notes == [
-        "Particles that are no gaussians were left out: '/points'.",
-        "Other geometry was left out: '/ball'.",
-        "The hint sortingModeHint is 'rayHitDistance', which was left out.",
-        "Attributes of gaussians were left out: 'velocities'.",
+        "Particles that are not gaussians were ignored: '/points'.",
+        "Other geometry was ignored: '/ball'.",
+        "The hint sortingModeHint is 'rayHitDistance' and was ignored.",
+        "Attributes of gaussians were ignored: 'velocities'.",
     ]
 
 

@@ -17,6 +17,7 @@ import pytest
 import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
+from reference import cluster as reference_cluster
 from reference import project as reference_project
 from v3dg import (
     BuildConfig,
@@ -33,6 +34,7 @@ from v3dg._device import CPU, place, resolve
 from v3dg.bundle.codec import codec_of
 from v3dg.levels.leaves import MemoryLeaves
 from v3dg.levels.plan import Plan
+from v3dg.levels.rows import RUN_ROWS
 from v3dg.levels.simplify import Level, LevelTables
 from v3dg.levels.smooth import measured_config
 
@@ -371,6 +373,19 @@ def test_level_zero_is_the_asset(asset, bundle):
     np.testing.assert_array_equal(*(r[np.lexsort(r.T)] for r in rows))
 
 
+@pytest.mark.parametrize("codec", ["float32", "quantized"])
+@pytest.mark.parametrize("config", [BuildConfig(steps=2), BuildConfig.paper(steps=2)])
+def test_neighbours_stand_together_in_the_clusters_of_every_level(config, codec, device):
+    # The paper's clusters are split after the fit.
+    config = replace(config, cluster_size=100, group_size=4)
+    asset = make_asset(num_gaussians=1500, seed=3)
+    bundle = build(asset, config, codec=codec, device=device)
+    for first, last in itertools.pairwise(bundle.clusters.offset):
+        runs = reference_cluster.runs(bundle.gaussians.means[first:last], RUN_ROWS)
+        np.testing.assert_array_equal(np.concatenate(runs), np.arange(last - first))
+    assert bundle.config["run_rows"] == RUN_ROWS
+
+
 def test_the_filter_of_an_asset_is_its_own(asset, bundle, device):
     """Level 0 is drawn with it; what is coarser is fitted to the asset without, or
     would be thicker."""
@@ -553,7 +568,7 @@ def test_gaussians_that_no_pixel_can_show_are_left_out_silently(asset, device):
 def test_asset_with_nothing_left_is_refused(asset, device):
     hidden = scenes.replaced(asset, opacities=np.full(1200, 0.001, np.float32))
     with pytest.raises(
-        ValueError, match=r"asset: expected a gaussian that can be drawn, got none: 1,200 of"
+        ValueError, match=r"asset: expected at least one gaussian that can be drawn, but 1,200 of"
     ):
         build(hidden, device=device)
 
@@ -586,7 +601,7 @@ def test_unknown_choice_for_unusable_gaussians_is_refused(asset):
         ({"image_size": 2**31}, "image_size: expected 0 to 8,192, got 2147483648"),
         (
             {"image_size": 8000},
-            "image_size: expected views of at most 8192 px a side with `supersample`",
+            "image_size: expected views of at most 8192 px a side after multiplication",
         ),
         ({"image_size": 2000, "num_views": 64}, "image_size: expected views of at most 8192 px"),
         ({"min_gaussians": 0}, "min_gaussians: expected 1 to 4,611,686,018,427,387,904, got 0"),

@@ -72,7 +72,9 @@ def test_processes_build_the_same_bytes(folder, tmp_path, at_package):
 def test_units_of_an_asset_in_memory_go_along(folder, tmp_path, at_package):
     asset = v3dg.read_asset(folder / "a.ply")
     with spawned_processes(1) as executor, small_units():
-        with pytest.raises(ValueError, match="resume_path: expected a file that all workers"):
+        with pytest.raises(
+            ValueError, match="resume_path: expected a file on a disk that all workers"
+        ):
             build_bundle(asset, executor=executor, **OPTIONS)
         bundle = build_bundle(asset, executor=executor, resume_path=tmp_path / "out", **OPTIONS)
     assert bundle.path == str(tmp_path / "out")
@@ -146,7 +148,7 @@ def test_workers_that_do_not_reach_the_folder_say_so(folder, tmp_path, at_packag
         spawned_processes(1) as pool,
         small_units(),
         pytest.raises(
-            RuntimeError, match=r"expected /elsewhere/out.v3dg.partial, got none; share its folder"
+            RuntimeError, match=r"/elsewhere/out.v3dg.partial does not exist there; put resume_path"
         ),
     ):
         build_file(folder / "a.ply", tmp_path / "out.v3dg", executor=Elsewhere(), **OPTIONS)
@@ -481,7 +483,8 @@ def test_what_is_no_address_is_told_so(address):
 
     with (
         pytest.raises(
-            RuntimeError, match=r"expected a dask scheduler such as tcp://host:8786, got no address"
+            RuntimeError,
+            match=r"expected a dask scheduler such as tcp://host:8786, got an invalid address",
         ),
         build._executor_at(address),
     ):

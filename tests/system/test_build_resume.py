@@ -235,7 +235,7 @@ def test_a_kill_while_it_becomes_a_bundle_loses_nothing(
 
 
 def test_what_is_unfinished_is_no_bundle(asset, checkpoint):
-    with pytest.raises(ValueError, match="levels: expected a bundle, got one that is not finished"):
+    with pytest.raises(ValueError, match="levels: expected a bundle, got an unfinished one"):
         v3dg.Bundle.open(checkpoint)
 
 
@@ -298,7 +298,7 @@ def test_resume_path_needs_a_folder(asset, tmp_path):
     with pytest.raises(IsADirectoryError, match="folder"):
         build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "folder")
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ValueError, match="pipe: expected a file of levels, got a device or a pipe"):
+    with pytest.raises(ValueError, match="pipe: expected an ordinary file, got a device or a pipe"):
         build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "pipe")
 
 
@@ -348,7 +348,7 @@ def test_links_at_the_levels_are_refused(asset, checkpoint, tmp_path, target):
         lambda: v3dg.levels.discard_levels(checkpoint),
     ):
         with pytest.raises(
-            ValueError, match="levels: expected a file of levels, got a link; remove it"
+            ValueError, match="levels: expected an ordinary file, got a symbolic link"
         ):
             use()
     checkpoint.unlink()

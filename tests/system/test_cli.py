@@ -216,7 +216,10 @@ def test_info_counts_rotations_of_length_zero(folder, tmp_path):
     asset.quats[:3] = 0
     v3dg.write_asset(tmp_path / "flat.ply", asset)
     done = run("info", tmp_path / "flat.ply")
-    assert "3 with a rotation of length zero, drawn unrotated; convert --drop-bad" in done.stdout
+    assert (
+        "3 with a rotation of length zero, drawn without rotation; convert --drop-bad"
+        in done.stdout
+    )
     assert json.loads(run("info", tmp_path / "flat.ply", "--json").stdout)["without_rotation"] == 3
     assert "rotation" not in run("info", folder / "tuft.ply").stdout
 
@@ -260,7 +263,7 @@ def test_build_leaves_out_what_cannot_be_drawn_and_says_so(dirty, tmp_path):
         "left out: 1 with a colour that is not finite, 1 with an opacity below 1/255" in done.stdout
     )
     assert v3dg.Bundle.open(tmp_path / "out.v3dg").config["asset_gaussians"] == 1000
-    message = f"{dirty}: asset: expected gaussians that can be drawn, got others: 2 of 1,000"
+    message = f"{dirty}: asset: expected only gaussians that can be drawn, but 2 of 1,000"
     (tmp_path / "out.v3dg").unlink()
     fails(1, message, "build", dirty, "-o", "out.v3dg", "--strict", cwd=tmp_path)
 
@@ -307,7 +310,7 @@ def test_info_does_not_list_hundreds_of_cameras(folder, tmp_path):
     scene.save(tmp_path / "many.json", {f"camera {i}": camera for i in range(300)})
     told = run("info", tmp_path / "many.json").stdout.splitlines()
     assert len([line for line in told if line.startswith("camera ")]) == 1 + 20
-    assert told[-1] == "and 280 more; --json has all"
+    assert told[-1] == "and 280 more; --json lists all"
     assert len(json.loads(run("info", tmp_path / "many.json", "--json").stdout)["cameras"]) == 300
 
 
@@ -524,7 +527,7 @@ def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
         ("build", "a.ply", "-o", "b.v3dg"),
         ("export", "a.v3dg", "-o", "a.v3dg"),
     ):
-        fails(2, "another file than the input", *command, cwd=tmp_path)
+        fails(2, "an output that is not the input", *command, cwd=tmp_path)
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 
@@ -551,7 +554,7 @@ def test_an_asset_with_wrong_values_is_drawn_without_them(folder, tmp_path):
     done = run("render", "nan.ply", "--size", 32, 32, "--up", "z", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["pictures"][0]["gaussians_in_frustum"] > 100
-    text = "gaussians have wrong values: "
+    text = "gaussians have invalid values: "
     fails(1, text, "convert", "nan.ply", "nan.spz", cwd=tmp_path)
 
 
@@ -563,7 +566,15 @@ def test_failures(folder):
         1, "expected a file name ending in .v3dg", "build", "tuft.ply", "-o", "tuft.zip", cwd=folder
     )
     fails(1, "tuft.ply: Not a directory", "build", "tuft.ply", "-o", "tuft.ply/a.v3dg", cwd=folder)
-    fails(1, "got a folder; tuft.v3dg is one", "build", "tuft.ply", "-o", "./", cwd=folder)
+    fails(
+        1,
+        "got a folder; tuft.v3dg would be a file in it",
+        "build",
+        "tuft.ply",
+        "-o",
+        "./",
+        cwd=folder,
+    )
     fails(1, "got a folder", "info", ".", cwd=folder)
     fails(
         1,
@@ -577,7 +588,7 @@ def test_failures(folder):
         cwd=folder,
     )
     fails(1, "tuft.ply: Not a directory", "render", "tuft.ply", "-o", "tuft.ply/a.png", cwd=folder)
-    fails(2, "a local file to write", "convert", "tuft.ply", "https://x/a.ply", cwd=folder)
+    fails(2, "a local file as output", "convert", "tuft.ply", "https://x/a.ply", cwd=folder)
     fails(1, ".png", "render", "tuft.ply", "-o", "tuft.gif", cwd=folder)
     fails(1, "tolerance", "render", "tuft.v3dg", "--tolerance", "-1", cwd=folder)
     fails(1, "near, far away", "render", "scene.json", "--camera", "left", cwd=folder)

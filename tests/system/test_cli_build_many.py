@@ -68,7 +68,7 @@ def test_bundles_that_exist_are_replaced_only_if_asked(folder):
     (folder / "c.v3dg").write_text("mine")
     done = run("build", ".", *FAST, cwd=folder)
     assert done.returncode == 2
-    assert "c.v3dg: exists already; --resume keeps" in done.stderr
+    assert "c.v3dg: already exists; --resume keeps" in done.stderr
     assert not (folder / "a.v3dg").exists()
     assert (folder / "c.v3dg").read_text() == "mine"
     assert run("build", ".", *FAST, "--overwrite", cwd=folder).returncode == 0
@@ -184,11 +184,11 @@ def test_an_interrupt_says_how_far_it_got(folder):
 
 
 def test_errors_before_anything_is_built(folder):
-    fails(2, "PATH: expected one or more assets", "build", cwd=folder)
+    fails(2, "PATH: expected at least one asset", "build", cwd=folder)
     (folder / "empty").mkdir()
     fails(1, "empty: expected a folder with assets (.ply", "build", "empty", cwd=folder)
     v3dg.write_asset(folder / "empty" / "a.ply", tiny())
-    message = "out/a.v3dg: expected one asset for it, got a.ply and empty/a.ply"
+    message = "out/a.v3dg: expected one asset for this bundle, got a.ply and empty/a.ply"
     (folder / "out").mkdir()
     fails(1, message, "build", "a.ply", "empty", "-o", "out", cwd=folder)
 
@@ -213,7 +213,7 @@ def test_several_files_make_one_asset(tmp_path):
     )
     assert (tmp_path / "city.v3dg").read_bytes() == (tmp_path / "again.v3dg").read_bytes()
     for amount, message in (
-        ("much", "expected bytes, or text like '8GiB', got 'much'"),
+        ("much", "expected a positive number of bytes, or text like '8GiB', got 'much'"),
         ("1", "expected at least 7"),
     ):
         fails(

@@ -160,7 +160,7 @@ def test_text_names_the_view_that_differs_most(folder, tmp_path):
     lines = done.stdout.splitlines()
     assert lines[0].split() == ["view", "FLIP", "PSNR", "SSIM", "gaussians"]
     assert [line.split()[0] for line in lines[1:4]] == ["near", "far", "mean"]
-    assert "which differs most" in lines[-1]
+    assert "which has the largest difference" in lines[-1]
 
 
 def test_a_view_that_shows_no_coarser_level_says_so(folder, tmp_path):
@@ -191,7 +191,7 @@ def test_errors(folder, tmp_path):
     (tmp_path / "compare.png").symlink_to("a.png")
     fails(
         2,
-        "compare.png: expected another file than the input a.png",
+        "compare.png: expected an output that is not the input a.png",
         "compare",
         "a.png",
         "b.png",
@@ -224,11 +224,11 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\ns
         (grey_png(8)[:50], "expected a PNG or a JPEG that is not damaged, got"),
         (
             grey_png(12_000),
-            "expected a picture of at most 65,500 px a side and 33,554,432 px in all",
+            "expected a picture of at most 65,500 px a side and at most 33,554,432 px in total",
         ),
         (grey_png(20_000), "expected a PNG or a JPEG that is not damaged, got Image size"),
         (grey_png(2**31 - 1), "expected a PNG or a JPEG that is not damaged, got Image size"),
-        (grey_png(8, depth=16, rows=8), "expected 8 bits a channel, got 16"),
+        (grey_png(8, depth=16, rows=8), "expected 8 bits per channel, got 16"),
     ],
 )
 def test_pictures_that_users_hand_in_are_refused_before_they_cost(tmp_path, content, message):

@@ -82,7 +82,7 @@ def test_what_cannot_be_meant_is_told(folder):
     before = sorted(folder.iterdir())
     fails(
         2,
-        "another file than the input donut.v3dg",
+        "an output that is not the input donut.v3dg",
         "refine",
         "donut.v3dg",
         "donut.v3dg",
@@ -102,7 +102,7 @@ def test_what_cannot_be_meant_is_told(folder):
     fails(1, "Not a directory", "refine", "donut.v3dg", "donut.v3dg/x.v3dg", cwd=folder)
     fails(
         1,
-        "steps: expected 1 step or more",
+        "steps: expected at least 1 step",
         "refine",
         "donut.v3dg",
         "x.v3dg",
@@ -111,6 +111,6 @@ def test_what_cannot_be_meant_is_told(folder):
         cwd=folder,
     )
     fails(1, "none.json", "refine", "donut.v3dg", "x.v3dg", "--cameras", "none.json", cwd=folder)
-    found = "cameras, got a file without any"
+    found = "cameras, got a file with none"
     fails(1, found, "refine", "donut.v3dg", "x.v3dg", "--cameras", "no_eyes.json", cwd=folder)
     assert sorted(folder.iterdir()) == before

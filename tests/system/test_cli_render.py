@@ -85,16 +85,16 @@ def test_a_link_of_the_viewer_places_the_camera(render):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--at", "http://x/#up=z"), "link: expected an address that the viewer's page has"),
+        (("--at", "http://x/#up=z"), "link: expected the address of the viewer's page"),
         (("--at", "#at=1,2&turn=1,0,0,0"), "3 numbers in at=, got 1,2"),
         (("--at", "#at=1,2,nan&turn=1,0,0,0"), "3 numbers in at=, got 1,2,nan"),
         (("--at", "#at=1,2,3&turn=0,0,0,0"), "a rotation of length 1 in turn="),
         (("--at", "#x", "--eye", 1, 2, 3), "--eye, --at: expected one of them"),
-        (("--target", 1, 2, 3), "--target: expected --eye beside it"),
+        (("--target", 1, 2, 3), "--target: expected --eye together with it"),
         (("--eye", 1, 2, 3, "--views", 3), "--views: expected a subject without cameras"),
         (("--eye", 1, 2, 3, "--fov", 180), "--fov: expected 0.001 to 179"),
         (("--background", "nocolor"), "--background: expected three numbers"),
-        (("--projection", "equirectangular"), "--size: expected twice the height as width"),
+        (("--projection", "equirectangular"), "--size: expected a width of twice the height"),
     ],
 )
 def test_wrong_options_are_refused_before_anything_is_read(render, options, message):
@@ -116,7 +116,9 @@ def test_a_transparent_picture_has_straight_alpha(render):
     np.testing.assert_allclose(alpha * picture[..., :3], pixels(black), atol=1.6)
     over_white = alpha * picture[..., :3] + 255 * (1 - alpha)
     np.testing.assert_allclose(over_white, pixels(white), atol=2.1)
-    assert "a .png for none" in render("--background", "none", output="a.jpg")[1]
+    assert (
+        "a .png for a transparent background" in render("--background", "none", output="a.jpg")[1]
+    )
 
 
 def test_views_become_a_film(render):
@@ -128,7 +130,10 @@ def test_views_become_a_film(render):
         stream = film.streams.video[0]
         assert stream.average_rate == 10
         assert sum(1 for _ in film.decode(stream)) == 5
-    assert "with even sides, got 63 x 48" in render("--size", 63, 48, output="odd.mp4")[1]
+    assert (
+        "with equal and even sizes for a film, got 63 x 48"
+        in render("--size", 63, 48, output="odd.mp4")[1]
+    )
 
 
 def test_a_film_flies_through_cameras_at_an_even_pace(render, tmp_path):
@@ -151,8 +156,8 @@ def test_a_film_flies_through_cameras_at_an_even_pace(render, tmp_path):
     steps = [np.abs(second - first).mean() for first, second in itertools.pairwise(pictures)]
     assert max(steps) < 2 * np.median(steps)
     alone = render(*options, "--camera", 0, "--seconds", 2, output="film.mp4")[1]
-    assert "--seconds: expected two or more cameras, got only 0.0.png" in alone
-    assert "a film (.mp4) beside it" in render("--views", 3, "--seconds", 2)[1]
+    assert "--seconds: expected at least two cameras, got only 0.0.png" in alone
+    assert "a film (.mp4) as output" in render("--views", 3, "--seconds", 2)[1]
 
 
 def test_render_says_what_is_not_drawn(folder, tmp_path, monkeypatch, capsys):

@@ -59,7 +59,7 @@ def test_versions_of_spz(folder):
     assert sizes[2] < sizes[3]
     fails(
         2,
-        "--spz-version: expected a .spz to write",
+        "--spz-version: expected a .spz as output",
         "convert",
         "tuft.ply",
         "a.sog",
@@ -148,7 +148,7 @@ def test_what_cannot_be_meant_is_refused(folder):
     fails(2, "--level: expected 0 to", "convert", "tuft.v3dg", "x.ply", "--level", "99", cwd=folder)
     fails(
         2,
-        "--level: expected no scene, camera, tolerance or budget with it",
+        "--level: expected no scene, camera, tolerance or budget together with it",
         "convert",
         "tuft.v3dg",
         "x.ply",
@@ -160,7 +160,7 @@ def test_what_cannot_be_meant_is_refused(folder):
     )
     fails(
         2,
-        "expected a bundle or a scene; build one first",
+        "expected a bundle or a scene, got an asset",
         "convert",
         "tuft.ply",
         "x.ply",
@@ -170,7 +170,7 @@ def test_what_cannot_be_meant_is_refused(folder):
     )
     fails(
         2,
-        "--camera: expected one camera to look from, got 2",
+        "--camera: expected exactly one camera, got 2",
         "convert",
         "scene.json",
         "x.ply",
@@ -194,10 +194,10 @@ def test_what_cannot_be_meant_is_refused(folder):
         "3",
         cwd=folder,
     )
-    fails(2, "expected a bundle as the input", "convert", "tuft.ply", "x.v3dg", cwd=folder)
+    fails(2, "expected a bundle as input", "convert", "tuft.ply", "x.v3dg", cwd=folder)
     fails(
         2,
-        "without options that choose a part",
+        "without options that select or change a part",
         "convert",
         "tuft.v3dg",
         "x.v3dg",

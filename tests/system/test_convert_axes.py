@@ -46,7 +46,7 @@ def test_an_asset_is_turned_from_what_its_plane_shows(folder, asset, suffix):
     np.testing.assert_allclose(heights(found, "-y"), heights(asset, "z"), atol=1e-3)
     assert result["notes"][0] == (
         "town.ply: z is up, guessed from the plane of its gaussians; "
-        f"town{suffix} is turned so that y is; change it with --up"
+        f"town{suffix} is rotated so that y is up; change it with --up"
     )
 
 
@@ -55,14 +55,14 @@ def test_a_file_without_axes_keeps_the_numbers_and_that_is_said(folder, asset):
     np.testing.assert_array_equal(found.means, asset.means)
     assert result["notes"] == [
         "town.ply: z is up, guessed from the plane of its gaussians; same.ply keeps it, "
-        "where most viewers take -y for up; --up z turns it"
+        "while most viewers assume -y; --up z rotates it"
     ]
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_up_overrides_what_is_found(folder, asset, suffix):
     result, found = convert(folder, "town.ply", f"turned{suffix}", "--up", "x")
-    assert result["up_reason"] == "turned from x, as --up says"
+    assert result["up_reason"] == "rotated from x, as requested by --up"
     np.testing.assert_allclose(heights(found, "-y"), heights(asset, "x"), atol=1e-5)
 
 
@@ -83,7 +83,7 @@ def test_spz_of_other_programs_says_what_it_was_taken_for(folder, asset):
     write_without_record(folder / "theirs.spz", upright)
     result, found = convert(folder, "theirs.spz", "theirs.ply")
     np.testing.assert_allclose(found.means, upright.means, atol=1e-3)
-    reason = "guessed from its ground, with which -y is up in the file"
+    reason = "guessed from its ground, which shows that -y is up in the file"
     assert result["notes"] == [f"theirs.spz: -y is up, {reason}"]
     told = run("info", "theirs.spz", cwd=folder)
     assert told.stdout.splitlines()[1] == f"-y is up, {reason}"
@@ -120,7 +120,11 @@ def test_who_turns_an_asset_is_not_turned_again(folder, asset):
         ("--rotate", "w:90", "--rotate: expected AXIS:DEGREES"),
         ("--rotate", "quaternion:0,0,0,0", "--rotate: expected AXIS:DEGREES"),
         ("--scale", 0, "--scale: expected a number above 0, got 0"),
-        ("--drop-bad", "--strict", "--strict: expected it or --drop-bad, got both"),
+        (
+            "--drop-bad",
+            "--strict",
+            "--strict: expected only one of --strict and --drop-bad, got both",
+        ),
     ],
 )
 def test_wrong_moves_are_refused(folder, option, value, message):
@@ -162,7 +166,7 @@ def with_faults(asset):
 def test_wrong_values_are_left_out_refused_or_kept_and_that_is_said(folder, asset):
     v3dg.write_asset(folder / "bad.ply", with_faults(asset))
     text = (
-        "3 of 2,000 gaussians have wrong values: 1 with a position that is not finite, "
+        "3 of 2,000 gaussians have invalid values: 1 with a position that is not finite, "
         "1 with a scale that is not finite, 1 with a rotation of length zero"
     )
     result, found = convert(folder, "bad.ply", "good.sog", "--drop-bad")

@@ -50,9 +50,9 @@ def test_edits_are_those_of_python_in_the_stated_order(folder):
 def test_the_text_says_how_many_were_left_out_and_why(folder):
     done = run("convert", "tuft.ply", "a.ply", "--drop-outliers", "--degree", "0", cwd=folder)
     assert "left out 1 of 2,001 gaussians: 1 outliers" in done.stdout
-    assert "SH of degree 1 cut to 0" in done.stdout
+    assert "SH reduced from degree 1 to 0" in done.stdout
     done = run("convert", "tuft.ply", "b.ply", "--degree", "3", cwd=folder)
-    assert "SH of degree 1 extended to 3 by zeros" in done.stdout
+    assert "SH extended from degree 1 to 3 with zeros" in done.stdout
     extended = v3dg.read_asset(folder / "b.ply").sh
     np.testing.assert_array_equal(extended[:, :4], v3dg.read_asset(folder / "tuft.ply").sh)
     assert extended.shape[1] == 16
@@ -109,7 +109,7 @@ def test_edits_apply_to_a_level_and_to_a_cut(folder):
         (2, "--crop: expected box:X0,Y0,Z0,X1,Y1,Z1 or sphere", ["--crop", "1,2,3"]),
         (2, "--crop: expected box:", ["--crop", "box:1,2,3,4,5"]),
         (2, "--crop: expected box:", ["--crop", "box:0,0,nan,1,1,1"]),
-        (2, "--crop: expected the smaller of each", ["--crop", "box:1,0,0,0,1,1"]),
+        (2, "--crop: expected the smaller value of each", ["--crop", "box:1,0,0,0,1,1"]),
         (2, "--delete: expected a finite centre", ["--delete", "sphere:0,0,0,-1"]),
         (2, "--min-opacity: expected 0 to 1, got 2", ["--min-opacity", "2"]),
         (2, "--degree: expected one of 0, 1, 2, 3", ["--degree", "4"]),
@@ -126,10 +126,10 @@ def test_wrong_edits_are_named_and_nothing_is_written(folder, code, message, opt
 
 def test_a_bundle_is_not_edited_and_no_input_is_overwritten(folder):
     fails(
-        2, "without options that choose a part",
+        2, "without options that select or change a part",
         "convert", "tuft.v3dg", "x.v3dg", "--degree", "0", cwd=folder,
     )  # fmt: skip
     fails(
-        2, "expected another file than the input tuft.ply",
+        2, "expected an output that is not the input tuft.ply",
         "convert", "tuft.v3dg", "tuft.ply", "--add", "tuft.ply@1,2,3", cwd=folder,
     )  # fmt: skip

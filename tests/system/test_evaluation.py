@@ -358,7 +358,7 @@ def test_a_picture_that_changes_between_runs_is_refused(tmp_path, scene, monkeyp
         return real(*arguments, **options, background=(len(drawn) / 10, 0.0, 0.0))
 
     monkeypatch.setattr(evaluation.evaluation, "render", flickering)
-    with pytest.raises(RuntimeError, match="same on every run"):
+    with pytest.raises(RuntimeError, match="same bytes in every run"):
         made.shoot(scene, view)
 
 

@@ -176,11 +176,11 @@ def test_rows_of_two_devices_are_refused():
     for name in scenes.NAMES[1:]:
         arrays = {n: getattr(here, n) for n in scenes.NAMES} | {name: getattr(there, name)}
         with pytest.raises(
-            ValueError, match=f"{name}: expected .*cuda:0 like the others, got .*cuda:1"
+            ValueError, match=f"{name}: expected .*cuda:0 like the other arrays, got .*cuda:1"
         ):
             _core.Rows(**arrays)
         with pytest.raises(
-            ValueError, match=f"{name}: expected device cuda:0 like the others, got cuda:1"
+            ValueError, match=f"{name}: expected device cuda:0 like the other arrays, got cuda:1"
         ):
             Gaussians(**arrays)
 

@@ -59,7 +59,9 @@ def test_a_new_asset_is_written_beside_what_is_shown(site, folder, keep, suffix)
     written = v3dg.read_asset(folder / f"part{suffix}")
     np.testing.assert_allclose(written.means, expected.means, atol=1e-3)
     counts = f"{len(expected):,} of {len(site.whole):,} gaussians"
-    assert notice == f"part{suffix} was written beside what is shown: {counts}."
+    assert (
+        notice == f"part{suffix} was written beside the file that is shown; it contains {counts}."
+    )
     assert sorted(path.name for path in folder.iterdir()) == ["blob.v3dg", f"part{suffix}"]
 
 
@@ -71,7 +73,7 @@ def test_no_file_is_ever_overwritten(site, folder):
         for name in ("there.ply", "link.ply"):
             notice = crop(tab, name)
             assert notice == (
-                f"Not done: {name}: there is such a file already; choose another name"
+                f"Not done: {name}: a file with this name already exists; choose another name"
             )
     assert (folder / "there.ply").read_text() == "mine"
     assert not (folder / "elsewhere.ply").exists()
@@ -95,7 +97,7 @@ def test_other_names_write_nothing(site, folder, name):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"box": ((8, 8, 8), (9, 9, 9))}, "Not done: box: nothing is left of"),
+        ({"box": ((8, 8, 8), (9, 9, 9))}, "Not done: box: nothing remains of"),
         ({"box": ((1, 0, 0), (0, 1, 1))}, "Not done: low, high: expected no coordinate"),
         ({"instance": 1}, "Not done: instance: expected 0 to 0, got 1"),
     ],

@@ -233,7 +233,7 @@ def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_pa
             "--budget: expected a bundle or a scene, got the asset asset.ply; build a bundle",
         ),
         (["asset.ply", "--port", "70000"], "--port: expected 0 to 65535, got 70000"),
-        (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a number, got inf"),
+        (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a finite number, got inf"),
         (
             ["asset.ply", "--host", "192.0.2.1"],
             "host: expected an address of this machine, got 192.0.2.1",
@@ -250,7 +250,9 @@ def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monk
 
 def test_cameras_without_names_are_refused(blob_view):
     before = set(threading.enumerate())
-    with pytest.raises(TypeError, match=r"cameras: expected cameras by their names.*, got list"):
+    with pytest.raises(
+        TypeError, match=r"cameras: expected a mapping from names to cameras.*, got list"
+    ):
         Site(blob_view, port=0, cameras=v3dg.turntable((0, 0, 0), 3.0, 2))
     assert set(threading.enumerate()) == before
 

@@ -61,9 +61,7 @@ def test_what_has_no_meaning_is_wrong(name):
 
 def test_counts_are_described_in_words():
     text = describe({"negative_scale": 1234, "transparent": 1})
-    assert (
-        text == "1,234 with a negative scale, 1 with an opacity below 1/255, which no pixel shows"
-    )
+    assert text == "1,234 with a negative scale, 1 with an opacity below 1/255, which is invisible"
 
 
 @pytest.mark.parametrize("filter_px2", [0.0, 0.3])

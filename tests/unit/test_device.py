@@ -103,8 +103,8 @@ def test_missing_torch_is_named(tmp_path):
     run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert run.stdout == "cpu\n"
     assert run.stderr.splitlines()[-1] == (
-        "RuntimeError: device: CUDA and gradients: expected torch>=2.2, got none or an older one; "
-        "pip install 'torch>=2.2'; or use 'cpu'"
+        "RuntimeError: device: CUDA and gradients: expected torch>=2.2, got no package or an "
+        "older version; run pip install 'torch>=2.2'; or use 'cpu'"
     )
 
 
@@ -209,10 +209,12 @@ def test_rows_that_begin_between_words_are_copied():
 def test_devices_cannot_be_mixed():
     g = scenes.gaussians([[0, 0, 1], [1, 2, 3]])
     there = g.torch("cuda")
-    with pytest.raises(ValueError, match="sh: expected device cuda:0 like the others, got cpu"):
+    with pytest.raises(
+        ValueError, match="sh: expected device cuda:0 like the other arrays, got cpu"
+    ):
         scenes.replaced(there, sh=g.torch().sh)
     with pytest.raises(
-        TypeError, match="sh: expected a torch tensor like the others, got a NumPy array"
+        TypeError, match="sh: expected a torch tensor like the other arrays, got a NumPy array"
     ):
         scenes.replaced(there, sh=g.sh)
 

@@ -128,7 +128,7 @@ def test_empty_assets_are_edited():
         (lambda a: v3dg.crop_box(a, (0, 0, 0), (1, 1, 1), keep="both"), "keep: expected 'inside'"),
         (lambda a: v3dg.crop_sphere(a, (0, 0, np.inf), 1), "center: expected finite numbers"),
         (lambda a: v3dg.crop_sphere(a, (0, 0, 0), 0), "radius: expected a positive number"),
-        (lambda a: v3dg.drop_transparent(a, 1.5), "min_opacity: expected a number of 0 to 1"),
+        (lambda a: v3dg.drop_transparent(a, 1.5), "min_opacity: expected a number from 0 to 1"),
         (lambda a: v3dg.to_degree(a, 4), "degree: expected at most 3, got 4"),
         (lambda _: v3dg.join([]), "parts: expected at least one"),
     ],

@@ -64,12 +64,12 @@ def test_survives_pickling():
         (
             {"quats": np.zeros((4, 4), np.float32)},
             ValueError,
-            "quats: expected shape (5, 4) to go with means (5, 3), got (4, 4)",
+            "quats: expected shape (5, 4) to match means of shape (5, 3), got (4, 4)",
         ),
         (
             {"opacities": np.zeros((5, 1), np.float32)},
             ValueError,
-            "opacities: expected shape (5,) to go with means (5, 3), got (5, 1)",
+            "opacities: expected shape (5,) to match means of shape (5, 3), got (5, 1)",
         ),
         (
             {"sh": np.zeros((5, 5, 3), np.float32)},
@@ -245,11 +245,11 @@ def test_refuses_a_mixture_of_kinds():
     torch = pytest.importorskip("torch")
     arrays = random_arrays(4)
     with pytest.raises(
-        TypeError, match="sh: expected a NumPy array like the others, got a torch tensor"
+        TypeError, match="sh: expected a NumPy array like the other arrays, got a torch tensor"
     ):
         Gaussians(**{**arrays, "sh": torch.from_numpy(arrays["sh"])})
     with pytest.raises(
-        TypeError, match=r"parts\[1\]\.means: expected a NumPy array like the others"
+        TypeError, match=r"parts\[1\]\.means: expected a NumPy array like the other arrays"
     ):
         Gaussians.concatenate([Gaussians(**arrays), Gaussians(**arrays).torch()])
 
@@ -267,7 +267,7 @@ def test_refuses_a_mixture_of_kinds():
         ),
         (
             lambda torch: torch.zeros(4, 4, 3, device="meta"),
-            "sh: expected device cpu like the others, got meta",
+            "sh: expected device cpu like the other arrays, got meta",
         ),
     ],
 )

@@ -235,7 +235,9 @@ def test_number_is_used_or_named(name, argument):
 
 
 def test_text_is_no_number():
-    with pytest.raises(ValueError, match="tolerance: expected 0 px² or more, got '3'"):
+    with pytest.raises(
+        ValueError, match="tolerance: expected a number of px² of at least 0, got '3'"
+    ):
         v3dg.render(BUNDLE, CAMERA, tolerance="3")
     with pytest.raises(ValueError, match=r"budget: expected a whole number .*, got 1000\.0"):
         v3dg.render(BUNDLE, CAMERA, budget=1e3)
@@ -326,7 +328,7 @@ ODD = (
 def test_memory_of_another_kind_is_refused_by_its_name(memory):
     bundle = random_bundle(1, num_levels=2)
     camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
-    expected = r"^memory: expected bytes, or text like '8GiB', got "
+    expected = r"^memory: expected a positive number of bytes, or text like '8GiB', got "
     with pytest.raises(ValueError, match=expected):
         v3dg.render(bundle, camera, memory=memory, device="cpu")
     with pytest.raises(ValueError, match=expected):
@@ -380,7 +382,8 @@ def test_a_renderer_of_another_subject_cannot_pick():
     for subject, drawn in ((small, large), (large, small), (small, several), (several, small)):
         renderer = v3dg.Renderer(drawn, memory="64MiB", device="cpu")
         with pytest.raises(
-            ValueError, match=r"^renderer: expected one of this subject, got one of another; "
+            ValueError,
+            match=r"^renderer: expected a renderer of this subject, got one of another subject; ",
         ):
             v3dg.pick(subject, camera, 4, 3, renderer=renderer)
         v3dg.pick(drawn, camera, 4, 3, renderer=renderer)

@@ -60,5 +60,7 @@ def test_only_the_azimuth_of_the_camera_counts():
 def test_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match="width: expected an even number"):
         v3dg.draw_panorama(draw_directions, CAMERA, (0, 0, 1), 33)
-    with pytest.raises(ValueError, match="up, camera: expected directions that are not parallel"):
+    with pytest.raises(
+        ValueError, match="up, camera: expected a camera that does not look along `up`"
+    ):
         v3dg.draw_panorama(draw_directions, CAMERA, (0, 1, 0), 32)

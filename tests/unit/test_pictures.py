@@ -14,7 +14,7 @@ from v3dg import pictures
     [
         (np.zeros((3, 4)), ValueError, r"shape \(H, W, 3\) with at least one pixel, got \(3, 4\)"),
         (np.zeros((0, 4, 3)), ValueError, r"at least one pixel, got \(0, 4, 3\)"),
-        (np.full((3, 4, 3), np.nan), ValueError, r"colours, got NaN"),
+        (np.full((3, 4, 3), np.nan), ValueError, r"colours without NaN, got NaN"),
         (np.zeros((3, 4, 3), int), ValueError, r"uint8, or floats in \[0,1\], got int64"),
         ([[[0, 0, 0]]], TypeError, "a NumPy array or a torch tensor, got list"),
     ],

@@ -1,5 +1,6 @@
 """Levels refined together: what gets better, what stays, and one step by itself."""
 
+import itertools
 import os
 import subprocess
 import sys
@@ -11,10 +12,12 @@ import pytest
 import v3dg
 from devices import host, on
 from random_bundle import random_bundle
+from reference import cluster as reference_cluster
 from v3dg import BuildConfig, _core
 from v3dg.donut import make_donut
 from v3dg.levels.fit import fit_config
 from v3dg.levels.refined import _without_least
+from v3dg.levels.rows import RUN_ROWS
 from v3dg.metrics import box_downsample, draw_truth
 from v3dg.refine import refine_bundle
 from v3dg.residency import residency
@@ -64,6 +67,22 @@ def test_tables_and_level_0_stay(bundle, device):
         np.testing.assert_array_equal(values[leaves], changed[leaves])
     boxes = _core.bound_by_boxes(refined.gaussians.rows, refined.clusters.offset)
     np.testing.assert_array_equal(refined.clusters.box, boxes)
+
+
+def test_neighbours_stand_together_in_clusters_of_an_earlier_build(bundle, device):
+    """Gaussians move and are dropped, and earlier builds kept the order of the
+    asset."""
+    offset = bundle.clusters.offset
+    rng = np.random.default_rng(1)
+    order = [first + rng.permutation(last - first) for first, last in itertools.pairwise(offset)]
+    gaussians = bundle.gaussians.subset(np.concatenate(order))
+    config = {name: value for name, value in bundle.config.items() if name != "run_rows"}
+    earlier = v3dg.Bundle(bundle.clusters, bundle.groups, gaussians, config)
+    refined = refine_bundle(earlier, steps=5, drop=0.1, device=device, progress=False)
+    assert refined.config["run_rows"] == RUN_ROWS
+    for first, last in itertools.pairwise(refined.clusters.offset):
+        runs = reference_cluster.runs(refined.gaussians.means[first:last], RUN_ROWS)
+        np.testing.assert_array_equal(np.concatenate(runs), np.arange(last - first))
 
 
 def test_a_quantised_bundle_stays_one(bundle, device):
@@ -121,10 +140,12 @@ def test_a_bundle_whose_asset_is_empty_stays_as_it_is(device):
 
 
 def test_wrong_arguments_are_told(bundle):
-    with pytest.raises(ValueError, match="steps: expected 1 step or more, got 0"):
+    with pytest.raises(ValueError, match="steps: expected at least 1 step, got 0"):
         refine_bundle(bundle, steps=0)
     for share in (-0.1, 0.6, np.nan, "some"):
-        with pytest.raises(ValueError, match=f"drop: expected a share of 0 to 0.5, got '?{share}"):
+        with pytest.raises(
+            ValueError, match=f"drop: expected a share from 0 to 0.5, got '?{share}"
+        ):
             refine_bundle(bundle, drop=share)
     with pytest.raises(TypeError, match="bundle: expected a Bundle, got Gaussians"):
         refine_bundle(make_donut(1000))

@@ -79,7 +79,7 @@ def test_quarter_turn_about_z_takes_x_to_y():
         ),
         (
             {"quaternions": [0, 0, 0, 0]},
-            "quaternions: expected a rotation, got a quaternion of zeros",
+            "quaternions: expected a nonzero quaternion, got zeros",
         ),
         ({"quaternions": [np.inf, 0, 0, 0]}, "quaternions: expected finite numbers, got inf"),
         ({"scales": [1, 2]}, r"scales: expected shape \(1,\), got \(2,\)"),
@@ -235,14 +235,14 @@ def test_up_keeps_what_is_right_and_applies_before_the_pose():
     before = scene.rotations
     scene.move(quaternions=quarter, up="z")
     np.testing.assert_allclose(scene.rotations, before, atol=1e-12)
-    with pytest.raises(ValueError, match="up: expected quaternions or a matrix beside up"):
+    with pytest.raises(ValueError, match="up: expected quaternions or a matrix together with up"):
         scene.move(positions=[(0, 0, 0)], up="z")
 
 
 def test_a_scene_has_one_axis_that_is_up():
     scene = Scene()
     scene.up = "y"
-    with pytest.raises(ValueError, match="up: expected y, which is up in this scene, got z"):
+    with pytest.raises(ValueError, match="up: expected y, the up axis of this scene, got z"):
         scene.add(BUNDLE, up="z")
     assert len(scene) == 0
     with pytest.raises(ValueError, match="up: expected 'x' or 'y'"):
@@ -280,14 +280,14 @@ def matrix_with(row, column, value):
     [
         (
             np.diag([1.0, 1, 2, 1]),
-            r"matrix: .*, got a scale for each axis: 1 1 2; instances cannot",
+            r"matrix: .*, got different scales: 1 1 2; instances cannot",
         ),
         (np.diag([1.0, 1, -1, 1]), "matrix: .*, got a mirror"),
         (np.diag([-2.0, -2, -2, 1]), "matrix: .*, got a mirror"),
         (matrix_with(0, 1, 0.3), "matrix: .*, got a shear"),
         (np.diag([0.0, 0, 0, 1]), "matrix: .*, got a scale of 0;"),
         (np.diag([1.0, 1, 0, 1]), "matrix: .*, got a scale of 0 along an axis"),
-        (matrix_with(3, 0, 0.5), "matrix: .*, got a last row of 0.5 0 0 1"),
+        (matrix_with(3, 0, 0.5), "matrix: .*, got the last row 0.5 0 0 1"),
         (np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])]), r"matrix\[1\]: .*, got a mirror"),
         (np.eye(3), r"matrix: expected shape \(4, 4\)"),
         (matrix_with(0, 0, np.nan), "matrix: expected finite numbers"),
@@ -305,9 +305,7 @@ def test_rounded_matrices_are_similarities():
     pose = similarity_of(noisy)
     np.testing.assert_allclose(rotation_from_quaternion(pose.quaternions)[0], rotation, atol=1e-4)
     np.testing.assert_allclose(pose.scales, 3, rtol=1e-4)
-    with pytest.raises(
-        ValueError, match="matrix: it already places the instances; leave out positions"
-    ):
+    with pytest.raises(ValueError, match="matrix: cannot be combined with positions"):
         Scene().add(BUNDLE, (0, 0, 0), matrix=noisy)
 
 
@@ -331,12 +329,12 @@ def test_opacity_and_tint_are_columns_like_others():
 @pytest.mark.parametrize(
     ("factors", "message"),
     [
-        ({"opacity": 1.5}, "opacity: expected numbers of 0 to 1, got 1.5"),
-        ({"opacity": -0.1}, "opacity: expected numbers of 0 to 1, got -0.1"),
+        ({"opacity": 1.5}, "opacity: expected numbers from 0 to 1, got 1.5"),
+        ({"opacity": -0.1}, "opacity: expected numbers from 0 to 1, got -0.1"),
         ({"opacity": np.nan}, "opacity: expected finite numbers"),
         ({"tint": (1, 1)}, "tint: expected shape"),
-        ({"tint": (1, -1, 1)}, "tint: expected numbers of 0 or more"),
-        ({"tint": (1, 1e39, 1)}, "tint: expected numbers of 0 or more that a float32 can hold"),
+        ({"tint": (1, -1, 1)}, "tint: expected numbers of at least 0"),
+        ({"tint": (1, 1e39, 1)}, "tint: expected numbers of at least 0 that a float32 can hold"),
     ],
 )
 def test_wrong_factors_are_named(factors, message):

@@ -25,7 +25,7 @@ def test_transform_moves_turns_and_scales(kind):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (((0, 0, 0, 0),), "quaternion: expected a rotation, got a quaternion of zeros"),
+        (((0, 0, 0, 0),), "quaternion: expected a nonzero quaternion, got zeros"),
         (((1, 0, 0, 0), (0, 0)), "position: expected shape"),
         (((1, 0, 0, 0), (0, 0, 0), 0), "scale: expected a positive number, got 0"),
     ],

@@ -170,7 +170,7 @@ def own_terminal():
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
-ASKED = "round.ply: which way is up, x, y, z, -x, -y, -z? [-y] "
+ASKED = "round.ply: which axis points up, x, y, z, -x, -y, -z? [-y] "
 
 
 @pytest.mark.parametrize(

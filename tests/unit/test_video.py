@@ -37,14 +37,14 @@ def test_tensors_make_a_film_too(av, tmp_path):
 @pytest.mark.parametrize(
     ("pictures", "message"),
     [
-        ([], "pictures: expected at least one, got none"),
+        ([], "pictures: expected at least one picture, got none"),
         (
             [np.zeros((15, 16, 3))],
             r"pictures: expected an even height and width, got \(15, 16, 3\)",
         ),
         (
             [np.zeros((16, 16, 3)), np.zeros((16, 18, 3))],
-            r"pictures: expected \(16, 16, 3\) as before, got \(16, 18, 3\)",
+            r"pictures: expected the shape \(16, 16, 3\) of the first picture, got \(16, 18, 3\)",
         ),
     ],
 )

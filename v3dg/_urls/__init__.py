@@ -1,8 +1,10 @@
-"""Files at URLs, which fsspec knows: the parts in use, or all of a file, are fetched
-into a nameless local file. `names` recognises and shows URLs, `addresses` says which
-hosts may be contacted, `http` sends requests to web servers and bounds what their
-answers cost, `others` does the same for other file systems, `failures` words the
-errors, and `opened` has the local files.
+"""Files at URLs that fsspec supports. The needed parts, or whole files, are downloaded
+into a local file without a name.
+
+`names` recognises and displays URLs. `addresses` decides which hosts may be contacted.
+`http` sends requests to web servers and limits the cost of answers; `others` does the
+same for other file systems. `failures` has the error messages, and `opened` manages the
+local files.
 """
 
 from v3dg._urls.names import beside as beside

@@ -1,4 +1,4 @@
-"""The reach of network addresses: a server on the internet must not redirect to an
+"""Classifies network addresses: a server on the internet must not redirect to an
 address of a local network."""
 
 import ipaddress
@@ -9,19 +9,19 @@ _Address: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class Reach(IntEnum):
-    """The part of the world from which an address can be reached; a redirect must not
-    lead to an address of a smaller reach."""
+    """The part of the world from which an address can be reached. A redirect must not
+    lead to an address with a smaller reach."""
 
     HOST = 0
-    """This machine or its link, also addresses that are no single host's."""
+    """This machine or its link; also addresses that do not belong to a single host."""
     PRIVATE = 1
     """A network that is not part of the internet."""
     PUBLIC = 2
     """The internet."""
 
 
-# RFC 6890, RFC 1122, RFC 3927, RFC 4291, RFC 5771. The lists in Python differ between
-# its versions.
+# Networks of reach HOST: RFC 6890, RFC 1122, RFC 3927, RFC 4291, RFC 5771. Python's own
+# lists are not used, because they differ between versions.
 _HOST = [
     ipaddress.ip_network(text)
     for text in (
@@ -35,7 +35,7 @@ _HOST = [
         "ff00::/8",
     )
 ]
-# RFC 1918, RFC 6598, RFC 6890, RFC 2544, RFC 5737.
+# Networks of reach PRIVATE: RFC 1918, RFC 6598, RFC 6890, RFC 2544, RFC 5737.
 _PRIVATE = [
     ipaddress.ip_network(text)
     for text in (
@@ -50,21 +50,22 @@ _PRIVATE = [
         "203.0.113.0/24",
     )
 ]
-# Only these are part of the internet, except ranges for documentation and protocols.
+# The IPv6 addresses of the internet, except for the ranges below, which are reserved
+# for documentation and protocols.
 _PUBLIC_IPV6 = ipaddress.ip_network("2000::/3")
 _PRIVATE_IPV6 = [ipaddress.ip_network(text) for text in ("2001::/23", "2001:db8::/32", "3fff::/20")]
-# RFC 6052 and RFC 4291: the last 32 bits are an address of IPv4.
+# In these networks, the last 32 bits are an IPv4 address (RFC 6052 and RFC 4291).
 _WITH_IPV4 = [ipaddress.ip_network(text) for text in ("64:ff9b::/96", "::/96")]
 
 
 def reach_of(address: str) -> Reach:
-    """Reach of an IP address; ValueError for any other text."""
+    """Return the reach of an IP address; raise ValueError for any other text."""
     parsed = ipaddress.ip_address(address.partition("%")[0])
     return min(map(_reach_of, _inner(parsed)))
 
 
 def is_address(host: str) -> bool:
-    """Return whether a host is given by its address and not by a name."""
+    """Return whether a host is an IP address and not a name."""
     try:
         ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
@@ -73,8 +74,8 @@ def is_address(host: str) -> bool:
 
 
 def _inner(address: _Address) -> list[_Address]:
-    """Return the IPv4 addresses to which a gateway translates an IPv6 address; the
-    address itself if there are none."""
+    """Return the IPv4 addresses to which a gateway translates an IPv6 address, or the
+    address itself if it is not translated."""
     if isinstance(address, ipaddress.IPv4Address) or any(address in network for network in _HOST):
         return [address]
     if address.ipv4_mapped is not None:

@@ -1,5 +1,5 @@
-"""Errors of URLs that cannot be read: each has the right type, and one line without
-secrets."""
+"""Converts errors about URLs to errors of the right type, with one line that contains
+no secrets."""
 
 import contextlib
 import errno
@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from v3dg._urls.names import cleaned, shown
 
 _AGAIN = "try again later"
-_LONGEST = 200  # characters of a library's message
+_LONGEST = 200  # number of characters of a library's message that are shown
 
 
 class Problem(Exception):
-    """The reason why a file cannot be fetched, and the type of the error; the text does
-    not contain the URL."""
+    """The reason why a file cannot be downloaded, and the type of the error that users
+    get. The text does not contain the URL."""
 
     def __init__(self, kind: type[OSError] | type[ValueError], text: str) -> None:
         super().__init__(text)
@@ -24,9 +24,10 @@ class Problem(Exception):
 
 
 def status_problem(status: int) -> Problem:
-    """Return the problem of an answer whose status is not a success."""
+    """Return the problem of an answer whose status code is an error."""
     try:
-        phrase = f"{status} {http.HTTPStatus(status).phrase}"  # a server's own text may be anything
+        # The server's own phrase is not used, as it may be any text.
+        phrase = f"{status} {http.HTTPStatus(status).phrase}"
     except ValueError:
         phrase = str(status)
     kind, advice = _kind_of_status(status)
@@ -39,7 +40,8 @@ def _kind_of_status(status: int) -> tuple[type[OSError], str]:
     if status in (401, 403):
         return (
             PermissionError,
-            "check user, password or signature in the URL; a signed one may have expired",
+            "check the user, the password or the signature in the URL; a signed URL may have "
+            "expired",
         )
     if status in (408, 504):
         return TimeoutError, _AGAIN
@@ -50,15 +52,15 @@ def _kind_of_status(status: int) -> tuple[type[OSError], str]:
 
 @contextlib.contextmanager
 def naming_errors(url: str) -> Iterator[None]:
-    """Turn any error of a package for URLs into one line, without the secrets in its
-    text."""
+    """Convert any error of a package for URLs to a one-line error, without the secrets
+    in its text."""
     try:
         yield
     except (ImportError, MemoryError):
         raise
     except Exception as error:
-        # The other error is not shown: its text, and those of its causes, may have the
-        # whole URL.
+        # The original error is not chained: its text, and those of its causes, may
+        # contain the whole URL.
         raise _failure_of(url, error) from None
 
 
@@ -71,11 +73,12 @@ def _failure_of(url: str, error: Exception) -> Exception:
 
 
 def _problem_of(url: str, error: Exception) -> Problem:
-    """Return the problem behind an error of the system, of fsspec or of aiohttp, whose
-    types are recognised by name."""
+    """Return the problem that caused an error of the system, of fsspec or of aiohttp.
+    The types of aiohttp are recognised by their names, because aiohttp may not be
+    installed."""
     names = {kind.__name__ for kind in type(error).__mro__}
     cause = error
-    # Aiohttp's reason why a connection could not be made.
+    # If aiohttp could not connect, this is the error of the system.
     system_error = getattr(error, "os_error", None)
     if isinstance(system_error, OSError):
         cause = system_error
@@ -94,9 +97,9 @@ def _problem_of(url: str, error: Exception) -> Problem:
         )
     if isinstance(cause, socket.gaierror):
         return Problem(
-            ConnectionError, "the name of the host is not known; check the address and the network"
+            ConnectionError, "the name of the host is unknown; check the address and the network"
         )
-    # Before 3.11, the timeout of asyncio is another type than that of the system.
+    # Before Python 3.11, asyncio's TimeoutError is not the built-in one.
     if isinstance(cause, TimeoutError) or "TimeoutError" in names:
         return Problem(TimeoutError, f"the server did not answer in time; {_AGAIN}")
     answer = _problem_of_answer(names)
@@ -109,17 +112,19 @@ def _problem_of(url: str, error: Exception) -> Problem:
 
 def _problem_of_connection(error: Exception, text: str) -> Problem:
     if isinstance(error, ConnectionRefusedError):
-        return Problem(ConnectionRefusedError, "the connection was refused; check host and port")
+        return Problem(
+            ConnectionRefusedError, "the connection was refused; check the host and the port"
+        )
     return Problem(
         ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}"
     )
 
 
 def _problem_of_answer(names: set[str]) -> Problem | None:
-    """Return the problem of a received answer, by the names of an error's types; None
-    for other errors."""
+    """Return the problem of an incomplete or invalid answer, by the type names of an
+    error; None for other errors."""
     if "ClientPayloadError" in names:
-        return Problem(ConnectionError, f"the server's answer was not complete; {_AGAIN}")
+        return Problem(ConnectionError, f"the server's answer was incomplete; {_AGAIN}")
     if names & {"ClientResponseError", "BadHttpMessage"}:
         return Problem(ConnectionError, "the server's answer is not valid HTTP; check the address")
     return None
@@ -129,7 +134,9 @@ def _problem_elsewhere(error: Exception, text: str) -> Problem:
     if isinstance(error, FileNotFoundError):
         return Problem(FileNotFoundError, "there is no such file; check the address")
     if isinstance(error, PermissionError):
-        return Problem(PermissionError, f"the file may not be read ({text}); check the credentials")
+        return Problem(
+            PermissionError, f"reading the file is not permitted ({text}); check the credentials"
+        )
     if isinstance(error, IsADirectoryError):
         return Problem(IsADirectoryError, "expected a file, got a folder")
     return Problem(OSError, f"expected a file, got {type(error).__name__}: {text}")
@@ -141,7 +148,7 @@ def _text_of(url: str, error: Exception) -> str:
 
 
 def no_room(folder: str, error: OSError | None = None) -> Problem:
-    """Return the problem of a full disk for temporary files."""
+    """Return the problem of a disk that is too full for temporary files."""
     reason = "no space left"
     if error is not None:
         reason = error.strerror or reason
@@ -149,5 +156,6 @@ def no_room(folder: str, error: OSError | None = None) -> Problem:
         if name is not None:
             reason += f" ({name})"
     return Problem(
-        OSError, f"no room for it in {folder}: {reason}; set TMPDIR to a folder with more"
+        OSError,
+        (f"no space for the file in {folder}: {reason}; set TMPDIR to a folder with more space"),
     )

@@ -1,10 +1,9 @@
-"""Files of web servers, which may be hostile: requested bytes, waiting time and memory
-are bounded by what a request needs.
+"""Reads files from web servers, which may be hostile: the number of downloaded bytes,
+the waiting time and the memory are limited to what a request needs.
 
-aiohttp makes the requests on the event loop of fsspec, without compression. This module
-follows redirects itself and checks each host before contacting it. It checks the
-address again when a connection is made, because a name may resolve to another address
-by then.
+aiohttp sends the requests on the event loop of fsspec, without compression. This module
+follows redirects itself and checks each host before contacting it. Addresses are
+checked again when a connection is made, because the name may have changed its address.
 """
 
 import asyncio
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 PATIENCE_S = 30.0
-"""Seconds until an answer begins, with all redirects, and for each `STEP_BYTES` of it.
-"""
+"""Time limit in seconds until an answer begins, including redirects, and for each
+`STEP_BYTES` of the answer."""
 
 STEP_BYTES = 128 << 10
 
@@ -46,14 +45,14 @@ _IDENTITY = {"Accept-Encoding": "identity"}
 
 
 class _SessionOptions(TypedDict, total=False):
-    """Options of aiohttp's sessions that users configure for fsspec."""
+    """The options of aiohttp's sessions that users may set in fsspec."""
 
     headers: Mapping[str, str]
     trust_env: bool
 
 
 class _RequestOptions(TypedDict, total=False):
-    """Options of aiohttp's requests that users configure for fsspec."""
+    """The options of aiohttp's requests that users may set in fsspec."""
 
     headers: Mapping[str, str]
     ssl: "ssl.SSLContext | bool | Fingerprint"
@@ -61,7 +60,8 @@ class _RequestOptions(TypedDict, total=False):
 
 
 class HttpFileSystem(Protocol):
-    """The used part of fsspec's file system of the web, which has no types."""
+    """The part of fsspec's web file system that this module uses; fsspec has no
+    types."""
 
     client_kwargs: _SessionOptions
     kwargs: _RequestOptions
@@ -70,7 +70,7 @@ class HttpFileSystem(Protocol):
 
 
 class _SessionKey(NamedTuple):
-    """Requests that share a session."""
+    """Requests with equal keys share a session."""
 
     process: int
     loop: int
@@ -79,15 +79,16 @@ class _SessionKey(NamedTuple):
 
 
 class _FileInfo(NamedTuple):
-    """The file's size, if known, and its tag, from the headers of an answer."""
+    """The size of a file (None if unknown) and its tag, from the headers of an
+    answer."""
 
     num_bytes: int | None
     tag: str
 
 
 class _ContentRange(NamedTuple):
-    """The first byte of a part, the byte behind its last, and the size of the file,
-    from the headers of an answer."""
+    """The offset of the first byte of a part, the offset after its last byte, and the
+    size of the file, from the headers of an answer."""
 
     first: int | None
     last: int | None
@@ -98,7 +99,7 @@ _sessions: dict[_SessionKey, "ClientSession"] = {}
 
 
 async def resolve(host: str, port: int) -> list[str]:
-    """Return the addresses of a host; tests replace this function."""
+    """Return the addresses of a host. Tests replace this function."""
     loop = asyncio.get_running_loop()
     entries = await loop.getaddrinfo(
         host, port, type=socket.SOCK_STREAM, flags=socket.AI_ADDRCONFIG
@@ -107,24 +108,24 @@ async def resolve(host: str, port: int) -> list[str]:
 
 
 class WebSource:
-    """One file of a web server; methods may be called on any thread.
+    """A file on a web server. Methods may be called from any thread.
 
     Attributes:
-        num_bytes: Size of the file; None if the server does not send it.
-        tag: Text that changes with the content; empty if the server sends none.
+        num_bytes: Size of the file in bytes; None if the server does not send it.
+        tag: Text that changes when the content changes; empty if the server sends none.
     """
 
     def __init__(self, file_system: HttpFileSystem, address: str) -> None:
         self._aiohttp: ModuleType = _extras.load("aiohttp")
         try:
             url = file_system.encode_url(address)
-        except ValueError:  # its text may contain a part of a password
+        except ValueError:  # the message may contain a part of a password
             raise _wrong_url() from None
         if not url.host:
             raise _wrong_url()
         self._url = url.with_user(None).with_fragment(None)
-        # Options that users configure for fsspec; only the first host may receive the
-        # headers.
+        # Users may set headers in fsspec. Only the host of the original URL receives
+        # them.
         session = file_system.client_kwargs
         request = file_system.kwargs
         self._headers = {**session.get("headers", {}), **request.get("headers", {})}
@@ -134,27 +135,27 @@ class WebSource:
         self._ssl = request.get("ssl", True)
         self._proxy = request.get("proxy")
         self._trust_env = bool(session.get("trust_env", False))
-        self._reach: Reach | None = None  # reach of the first host, once it is known
+        # Reach of the first host; None until it is known.
+        self._reach: Reach | None = None
         self._gives_parts = False
         info = _run(self._info())
         self.num_bytes = info.num_bytes
         self.tag = info.tag
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes from each first to each last; returns whether all of the file
-        came instead."""
+        """Write the bytes of all parts (offset of the first byte, offset after the
+        last). Return whether the server sent the whole file instead."""
         return _run(self._read_parts(parts, write))
 
     def read_all(self, max_bytes: int, write: Write) -> int:
-        """Write the whole file, which may have at most `max_bytes`, and return its
-        size."""
+        """Write the whole file, of at most `max_bytes`, and return its size."""
         return _run(self._read_all(max_bytes, write))
 
     async def _info(self) -> _FileInfo:
         async with self._answer("HEAD") as answer:
             if answer.status == 200 and answer.content_length is not None:
                 return _FileInfo(answer.content_length, _tag_of(answer))
-        # Some servers know no HEAD, and some signatures are for GET alone.
+        # Some servers do not support HEAD, and some signatures are valid only for GET.
         async with self._answer("GET", "bytes=0-0") as answer:
             if answer.status == 200:
                 return _FileInfo(answer.content_length, _tag_of(answer))
@@ -172,7 +173,7 @@ class WebSource:
         try:
             return any(await asyncio.gather(*tasks))
         finally:
-            for task in tasks:  # one that fails ends the others
+            for task in tasks:  # the first failure cancels the other requests
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
@@ -185,7 +186,11 @@ class WebSource:
                 raise changed(first, last, 0)
             if answer.status == 200:
                 raise Problem(
-                    ConnectionError, "the server gave parts of the file before and now does not"
+                    ConnectionError,
+                    (
+                        "the server sent parts of the file before but no longer does; try again "
+                        "later"
+                    ),
                 )
             if answer.status != 206:
                 raise status_problem(answer.status)
@@ -195,13 +200,13 @@ class WebSource:
             return False
 
     def _check_range(self, content: _ContentRange, first: int, last: int) -> None:
-        """Refuse a part of a file whose size changed, and a part that was not
-        requested."""
+        """Raise an error if the size of the file has changed, or if the part is not the
+        requested one."""
         if content.num_bytes is not None and content.num_bytes != self.num_bytes:
-            problem = f"one of {content.num_bytes}; it has changed, open it again"
+            problem = f"one of {content.num_bytes} bytes; the file has changed, open it again"
             raise Problem(ValueError, f"expected a file of {self.num_bytes} bytes, got {problem}")
         if (content.first, content.last) != (first, last):
-            problem = f"an answer with those from {content.first} to {content.last}"
+            problem = f"those from {content.first} to {content.last}; check the server"
             raise Problem(
                 ConnectionError, f"expected the bytes from {first} to {last}, got {problem}"
             )
@@ -217,8 +222,8 @@ class WebSource:
 
     @contextlib.asynccontextmanager
     async def _answer(self, method: str, part: str = "") -> "AsyncIterator[ClientResponse]":
-        """Yield the first answer that is not a redirect, once its headers have come;
-        the caller may read the body."""
+        """Yield the first answer that is not a redirect, once its headers have arrived.
+        The caller may read the body."""
         headers: dict[str, str] = {}
         if part:
             headers["Range"] = part
@@ -227,11 +232,12 @@ class WebSource:
             encoding = answer.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding not in ("", "identity") and answer.status < 300:
                 raise Problem(
-                    ConnectionError, "expected the file uncompressed, got a compressed answer"
+                    ConnectionError,
+                    ("expected an uncompressed answer, got a compressed one; check the server"),
                 )
             yield answer
         finally:
-            answer.close()  # even if its body is endless
+            answer.close()  # also ends endless bodies
 
     async def _follow(self, method: str, headers: Mapping[str, str]) -> "ClientResponse":
         url = self._url
@@ -262,8 +268,8 @@ class WebSource:
         )
 
     def _session(self, reach: Reach) -> "ClientSession":
-        """Return a session that keeps its connections open and connects only to hosts
-        that have at least this reach."""
+        """Return a session with persistent connections, which only connects to hosts of
+        at least this reach."""
         loop = asyncio.get_running_loop()
         key = _SessionKey(os.getpid(), id(loop), reach, self._trust_env)
         if key not in _sessions:
@@ -283,7 +289,7 @@ class WebSource:
 
 
 def _run(work: Coroutine[None, None, T]) -> T:
-    """Run a coroutine on the event loop of fsspec; an interrupt of this thread cancels
+    """Run a coroutine on the event loop of fsspec. An interrupt of this thread cancels
     it."""
     future = asyncio.run_coroutine_threadsafe(work, _extras.load("fsspec.asyn").get_loop())
     try:
@@ -300,7 +306,7 @@ def _close(process: int, loop: asyncio.AbstractEventLoop, session: "ClientSessio
 
 
 def _resolver(least_reach: Reach) -> "AbstractResolver":
-    """Return a resolver for aiohttp that leaves out addresses of a smaller reach."""
+    """Return a resolver for aiohttp that omits addresses of a smaller reach."""
     from aiohttp.abc import AbstractResolver
 
     class Resolver(AbstractResolver):
@@ -335,12 +341,12 @@ def _entry(host: str, port: int, address: str) -> "ResolveResult":
 
 
 async def _checked(url: "URL", least_reach: Reach | None) -> Reach:
-    """Reach of a host, which is the largest of its addresses; a host below
-    `least_reach` is refused."""
+    """Return the reach of a host, the largest reach of its addresses; raise an error if
+    it is below `least_reach`."""
     host = url.host
     port = url.port
     assert host is not None
-    assert port is not None  # URLs of the web always have one
+    assert port is not None  # URLs with http or https always have a port
     addresses = [host]
     if not is_address(host):
         addresses = await resolve(host, port)
@@ -351,19 +357,19 @@ async def _checked(url: "URL", least_reach: Reach | None) -> Reach:
 
 
 def _wrong_url() -> Problem:
-    advice = "check it, and write special characters of a password as %XX"
+    advice = "check the URL, and write special characters of a password as %XX"
     return Problem(ValueError, f"expected a URL with a host; {advice}")
 
 
 def _refused() -> Problem:
-    advice = "if it is meant, use its own address"
+    advice = "if the redirect is intended, use the private address directly"
     return Problem(
-        PermissionError, f"refused to go on from a public server to a private address; {advice}"
+        PermissionError, f"refused a redirect from a public server to a private address; {advice}"
     )
 
 
 def _next_url(url: "URL", location: str) -> "URL":
-    """Return the URL that a redirect leads to, without another user or password."""
+    """Return the URL to which a redirect leads, without a user and a password."""
     try:
         target = url.join(type(url)(location)).with_user(None).with_fragment(None)
         is_web = bool(location) and target.scheme in ("http", "https") and bool(target.host)
@@ -372,7 +378,7 @@ def _next_url(url: "URL", location: str) -> "URL":
     if not is_web:
         raise Problem(
             ConnectionError,
-            "the server redirects to something that is no web address; check the address",
+            "the server redirects to something other than a web address; check the address",
         )
     return target
 
@@ -387,7 +393,10 @@ def _tag_of(answer: "ClientResponse") -> str:
 def _range_of(answer: "ClientResponse") -> _ContentRange:
     match = _RANGE.fullmatch(answer.headers.get("Content-Range", "").strip())
     if not match:
-        raise Problem(ConnectionError, "the server sent a part of the file without saying which")
+        raise Problem(
+            ConnectionError,
+            "the server sent a part of the file without its range; check the server",
+        )
     last = _number(match[2])
     if last is not None:
         last += 1
@@ -401,7 +410,8 @@ def _number(text: str | None) -> int | None:
 
 
 async def _read(answer: "ClientResponse", first: int, last: int, write: Write) -> None:
-    """Write a body that must have exactly the bytes from the first to the last."""
+    """Write a body, which must have exactly the bytes from offset `first` to before
+    `last`."""
     length = answer.content_length
     if length is not None and length != last - first:
         raise changed(first, last, length)
@@ -411,8 +421,8 @@ async def _read(answer: "ClientResponse", first: int, last: int, write: Write) -
 
 
 async def _read_to_end(answer: "ClientResponse", first: int, max_bytes: int, write: Write) -> int:
-    """Write a body of at most `max_bytes` and return its size; each piece must arrive
-    in time."""
+    """Write a body of at most `max_bytes` and return its size. Each `STEP_BYTES` must
+    arrive within `PATIENCE_S`."""
     num_bytes = 0
 
     async def step() -> bool:

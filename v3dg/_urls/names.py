@@ -1,51 +1,51 @@
-"""Recognises URLs, and shows them without the parts that may be secret."""
+"""Recognises URLs, and displays them without parts that may be secret."""
 
 import os
 import re
 from pathlib import Path
 from urllib.parse import unquote
 
-# A `Path` of a URL has one slash where there were two.
+# Converting a URL to a `Path` removes one of the two slashes, so one is enough.
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+(?=.)")
 _URL_IN_TEXT = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/+[^\s'\"<>]+")
 _SECRET = re.compile(r"[@?#]")
 
 
 def is_url(path: str | os.PathLike[str]) -> bool:
-    """Return whether a name is a URL and not the name of an existing local file."""
+    """Return whether a name is a URL; the name of an existing local file is not."""
     return bool(_URL.match(os.fspath(path))) and not os.path.lexists(path)
 
 
 def full(path: str | os.PathLike[str]) -> str:
-    """Return the complete URL, with the slash that a `Path` of it has lost."""
+    """Return a complete URL; restore the slash that is missing if it was a `Path`."""
     return _URL.sub(_with_slashes, os.fspath(path), count=1)
 
 
 def shown(path: str | os.PathLike[str]) -> str:
-    """Return the name of a file in messages and results; for a URL, without the parts
-    that may be secret."""
+    """Return the name of a file for messages and results; for a URL, omit parts that
+    may be secret."""
     if is_url(path):
         return _without_secrets(full(path))
     return os.fspath(path)
 
 
 def cleaned(text: str) -> str:
-    """Return a text of another program or server, in which every URL is shown without
-    the parts that may be secret."""
+    """Return the text of another program or server; URLs in it are shown without parts
+    that may be secret."""
     return _URL_IN_TEXT.sub(_cleaned_match, text)
 
 
 def beside(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a local file; for a URL, its file name in the working
-    folder."""
+    """Return the path of a local file; for a URL, return the file's name as a path in
+    the working directory."""
     if not is_url(path):
         return Path(path)
     return Path(os.path.basename(unquote(_place_of(full(path))[1])))
 
 
 def folder_of(path: str | os.PathLike[str]) -> str:
-    """Return the name of the folder that a local file or a URL is in; empty for the
-    top."""
+    """Return the name of the folder that contains a local file or a file at a URL;
+    empty for the root."""
     if not is_url(path):
         return Path(path).resolve().parent.name
     return os.path.basename(os.path.dirname(unquote(_place_of(full(path))[1])))
@@ -73,13 +73,14 @@ def _without_secrets(url: str) -> str:
 
 
 def _place_of(url: str) -> tuple[str, str]:
-    """Return the host of a URL, with its port, and the path."""
+    """Return the host of a URL, including its port, and the path."""
     address = url.partition("://")[2]
     host = re.split("[/?#]", address, maxsplit=1)[0]
     if "@" in host:
         start = host.rindex("@") + 1
     elif "@" in address and not re.fullmatch(r"(\[.*\]|[^:]*)(:[0-9]*)?", host):
-        start = address.rindex("@") + 1  # a password with a character that ends the host
+        # A character of the password looks like the end of the host.
+        start = address.rindex("@") + 1
     else:
         start = 0
     shown_part = re.split("[?#]", address[start:], maxsplit=1)[0]

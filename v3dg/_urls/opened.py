@@ -1,5 +1,5 @@
-"""Files at URLs that this process reads: the parts in use are fetched once, into a
-nameless local file."""
+"""Files at URLs that this process has opened. The parts that are used are downloaded
+once, into a local file without a name."""
 
 import contextlib
 import os
@@ -21,35 +21,35 @@ from v3dg._urls.others import OtherSource
 
 Source: TypeAlias = WebSource | OtherSource
 
-_BLOCK_BYTES = 1024  # bytes of a block, the unit that is fetched; pages have far more
-_MOST_BLOCKS = 1 << 12  # blocks of a piece, the largest request
-_MOST_PIECES = 8  # pieces that are requested at once
-# A file of unknown size is fetched up to this size.
+# Size of a block, the smallest unit that is downloaded; pages are much larger.
+_BLOCK_BYTES = 1024
+_MOST_BLOCKS = 1 << 12  # number of blocks in a piece, the largest unit of a request
+_MOST_PIECES = 8  # number of pieces that are requested at once
+# Maximum size of a file whose server does not send the size.
 _MOST_UNKNOWN_BYTES = 2 << 30
-# Bytes that stay free on the disk of temporary files.
+# Number of bytes that must stay free on the disk of temporary files.
 _SPARE_BYTES = 256 << 20
-# Number of URLs whose files are kept open for the next use; a file that is in use stays
-# open anyway.
+# Number of files that are kept open for later use. Files in use are not counted.
 _MOST_OPENED = 256
-# The USD library depends on the end of a name.
+# The USD library selects the format by the end of the name.
 _NEEDS_NAME = (".usd", ".usda", ".usdc", ".usdz")
 
 _opened: dict[str, "FileAtUrl"] = {}
 
 
 def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUrl":
-    """Open a file at a URL without fetching anything yet; the name of a local file is
-    returned unchanged.
+    """Open a file at a URL without downloading it yet. Return the name of a local file
+    unchanged.
 
-    A file that is unchanged according to its server is not fetched again.
+    If the server reports that a file is unchanged, it is not downloaded again.
 
     Raises:
-        ImportError: The extra `fsspec`, or a package that it needs for such URLs, is
-            not installed.
-        ValueError: The URL is not that of a file, or the file names other files, or
-            lies inside of another file.
+        ImportError: The extra `fsspec`, or a package that fsspec needs for this kind of
+            URL, is not installed.
+        ValueError: The URL is not that of a file, the file refers to other files, or it
+            is inside another file.
         FileNotFoundError, PermissionError, TimeoutError, ConnectionError, OSError: The
-            file cannot be fetched.
+            file cannot be downloaded.
     """
     if not is_url(path):
         return path
@@ -59,9 +59,11 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
     check(
         shown(url),
         name and not name.endswith(".json"),
-        f"{expected}, got the URL of a file that names other files",
+        f"{expected}, got the URL of a file that refers to other files; download its folder",
     )
-    check(shown(url), "::" not in url, f"{expected}, got a chain of places; fetch the file")
+    check(
+        shown(url), "::" not in url, f"{expected}, got a chain of URLs with '::'; download the file"
+    )
     with naming_errors(url):
         source = _source_of(url)
     file = _opened.pop(url, None)
@@ -75,8 +77,8 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
 
 @contextlib.contextmanager
 def reading(path: "str | os.PathLike[str] | FileAtUrl") -> Iterator[str | os.PathLike[str]]:
-    """Yield a name under which a reader can open a file; a URL is fetched as a whole,
-    and errors inside the context name the URL."""
+    """Yield a name under which a reader can open the file. A file at a URL is
+    downloaded as a whole, and errors inside the context contain its URL."""
     file = path
     if not isinstance(file, FileAtUrl):
         file = in_parts(file)
@@ -107,15 +109,16 @@ def _source_of(url: str) -> Source:
 
 
 class FileAtUrl(os.PathLike[str]):
-    """A file at a URL, and a nameless local file, into which the parts in use are
-    fetched once. Nothing of it remains on disk, however the process ends.
+    """A file at a URL. The parts that are used are downloaded once into a local file
+    without a name, of which nothing remains on disk, however the process ends.
 
     Attributes:
-        file: The local file; bytes that are not fetched are 0, or missing at the end.
-        num_bytes: Size of the file at the URL.
-        tag: Text that changes with the content at the URL; empty if the server sends
-            none.
-        needs_name: Whether its reader depends on the end of the name.
+        file: The local file. Bytes that are not downloaded yet are 0, or missing at the
+            end.
+        num_bytes: Size of the file at the URL in bytes.
+        tag: Text that changes when the content at the URL changes; empty if the server
+            sends none.
+        needs_name: Whether the reader for this format depends on the end of the name.
     """
 
     def __init__(self, url: str, source: Source) -> None:
@@ -123,14 +126,15 @@ class FileAtUrl(os.PathLike[str]):
         self._source = source
         self.tag = source.tag
         self.needs_name = beside(url).suffix.lower() in _NEEDS_NAME
-        self.file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  # as long as this lives
+        # The finalizer closes the file.
+        self.file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
         weakref.finalize(self, self.file.close)
         self._lock = threading.Lock()
         self._is_whole = False
-        # By piece, whether each block is fetched.
+        # For each piece, whether each of its blocks is downloaded.
         self._is_fetched: dict[int, NDArray[np.bool_]] = {}
         self.num_bytes = -1
-        if source.num_bytes is None:  # a file of unknown size has no parts
+        if source.num_bytes is None:  # without the size, parts cannot be requested
             self._fetch_whole()
         else:
             self.num_bytes = source.num_bytes
@@ -140,11 +144,12 @@ class FileAtUrl(os.PathLike[str]):
 
     @contextlib.contextmanager
     def named(self) -> Iterator[str]:
-        """Yield the name of a local file with all of the content, which is valid inside
-        the context; raise the errors of `fetch`.
+        """Yield the name of a local file with the whole content, valid inside the
+        context. Raises the errors of `fetch`.
 
-        The name is that of an open file of this process. For a reader that depends on
-        the end of a name, it is a link to that, which is removed afterwards.
+        The name refers to an open file of this process. If the reader depends on the
+        end of the name, it is a symbolic link to that file, which is removed
+        afterwards.
         """
         self._fetch_whole()
         name = f"/proc/self/fd/{self.file.fileno()}"
@@ -157,11 +162,12 @@ class FileAtUrl(os.PathLike[str]):
             yield link
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
-        """Fetch the bytes from each first to each last; may be called on any thread.
+        """Download the bytes of all parts (offset of the first byte, offset after the
+        last). May be called from any thread.
 
         Raises:
-            OSError: The bytes cannot be fetched, or the disk is full.
-            ValueError: The bytes are not in the file, or the file has changed.
+            OSError: The bytes cannot be downloaded, or the disk is full.
+            ValueError: A part is outside the file, or the file has changed.
         """
         if self._is_whole:
             return
@@ -184,11 +190,11 @@ class FileAtUrl(os.PathLike[str]):
                 is_fetched[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
 
     def _missing(self, parts: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Return the runs of blocks that the parts need and that are not fetched yet;
-        none is longer than a piece."""
+        """Return the runs of blocks that are needed for the parts and are not
+        downloaded yet; no run is longer than a piece."""
         is_needed: dict[int, NDArray[np.bool_]] = {}
         for first, last in parts:
-            expected = f"parts of its {self.num_bytes} bytes, got {first} to {last}"
+            expected = f"a part within its {self.num_bytes} bytes, got {first} to {last}"
             check(shown(self), 0 <= first <= last <= self.num_bytes, expected)
             first_block = first // _BLOCK_BYTES
             last_block = -(-last // _BLOCK_BYTES)

@@ -1,4 +1,4 @@
-"""Files of the other file systems that fsspec knows, apart from the web."""
+"""Reads files from the other file systems that fsspec supports, apart from the web."""
 
 import contextlib
 import re
@@ -10,17 +10,18 @@ from typing import BinaryIO, Protocol, TypeAlias, cast
 from v3dg._urls.failures import Problem
 
 Write: TypeAlias = Callable[[bytes, int], None]
-"""Writes bytes at an offset of the file that is read."""
+"""Writes bytes at an offset of the local file."""
 
 _STEP_BYTES = 1 << 20
-# Fields that change with the content of a file, as fsspec's packages name them.
+# Fields of fsspec's file information that change with the content of a file.
 _TAG = re.compile(
     r"tag|md5|sha|crc|checksum|digest|modif|mtime|created|updated|generation|version", re.IGNORECASE
 )
 
 
 class FileSystem(Protocol):
-    """The used part of a file system of fsspec, which has no types."""
+    """The part of a file system of fsspec that this module uses; fsspec has no
+    types."""
 
     async_impl: bool
 
@@ -34,11 +35,13 @@ class FileSystem(Protocol):
 
 
 class OtherSource:
-    """One file of a file system of fsspec.
+    """A file in a file system of fsspec.
 
     Attributes:
-        num_bytes: Size of the file; None if it is not known before everything is read.
-        tag: Text that changes with the content; empty if the file system has none.
+        num_bytes: Size of the file in bytes; None if it is unknown until the whole file
+            is read.
+        tag: Text that changes when the content changes; empty if the file system has
+            none.
     """
 
     def __init__(self, file_system: FileSystem, path: str) -> None:
@@ -49,14 +52,14 @@ class OtherSource:
             self.tag = str(info)
         self._file_system = file_system
         self._path = path
-        # Only asynchronous file systems may be used by several threads.
+        # Only asynchronous file systems may be used by several threads at once.
         self._lock: AbstractContextManager[object] = threading.Lock()
         if file_system.async_impl:
             self._lock = contextlib.nullcontext()
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes from each first to each last; returns whether all of the file
-        came instead."""
+        """Write the bytes of all parts (offset of the first byte, offset after the
+        last). Return whether the file system sent the whole file instead."""
         firsts = [first for first, _ in parts]
         lasts = [last for _, last in parts]
         with self._lock:
@@ -64,7 +67,7 @@ class OtherSource:
         for (first, last), data in zip(parts, answers, strict=True):
             if isinstance(data, Exception):
                 raise data
-            if len(data) == self.num_bytes:  # this file system cannot read parts
+            if len(data) == self.num_bytes:  # the file system cannot read parts
                 write(data, 0)
                 return True
             if len(data) != last - first:
@@ -73,8 +76,7 @@ class OtherSource:
         return False
 
     def read_all(self, max_bytes: int, write: Write) -> int:
-        """Write the whole file, which may have at most `max_bytes`, and return its
-        size."""
+        """Write the whole file, of at most `max_bytes`, and return its size."""
         num_bytes = 0
         with self._lock, self._file_system.open(self._path, "rb") as file:
             while data := file.read(_STEP_BYTES):
@@ -86,17 +88,17 @@ class OtherSource:
 
 
 def changed(first: int, last: int, num_bytes: int) -> Problem:
-    """Return the problem of a part that has another number of bytes than was
-    requested."""
+    """Return the problem of a part whose length is not the requested one."""
     text = (
-        f"expected {last - first} bytes at {first}, got {num_bytes}; it has changed, open it again"
+        f"expected {last - first} bytes at offset {first}, got {num_bytes}; the file has changed, "
+        "open it again"
     )
     return Problem(ValueError, text)
 
 
 def too_long(max_bytes: int) -> Problem:
-    """Return the problem of a file that does not end."""
+    """Return the problem of a file that is larger than allowed."""
     return Problem(
         ValueError,
-        f"expected at most {max_bytes} bytes, got more; check the address, or fetch the file",
+        f"expected at most {max_bytes} bytes, got more; check the address, or download the file",
     )

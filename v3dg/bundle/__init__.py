@@ -1,5 +1,5 @@
-"""Bundle: all clusters of all levels of one asset, with the tables that selection
-reads; write and open."""
+"""Bundles: the clusters of all levels of one asset, with the tables that selection
+reads, and their files."""
 
 from v3dg.bundle.bundle import Bundle
 from v3dg.bundle.tables import NESTING_MARGIN, Clusters, Groups

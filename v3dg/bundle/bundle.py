@@ -1,4 +1,5 @@
-"""Bundle: all clusters of all levels of one asset; write and open."""
+"""The class `Bundle`: the clusters of all levels of one asset, in memory or in a
+file."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
 _Pages: TypeAlias = MemoryPages | CodePages | FilePages
-_RUN_BYTES = 64 << 20  # bytes of pages that are written together
+_RUN_BYTES = 64 << 20  # bytes of pages that are encoded together
 
 
 class Bundle:
@@ -38,11 +39,11 @@ class Bundle:
     read on demand.
 
     Attributes:
-        config: The settings of the build, as JSON values.
-        sh_degree: 0 to 3, the same for all gaussians.
+        config: The settings of the build as a JSON object.
+        sh_degree: SH degree of all gaussians, 0 to 3.
         codec: The encoding of gaussians in the file. "float32" is lossless. "quantized"
             takes 16 bytes (SH degree 0) to 40 bytes (degree 3) per gaussian, and rounds
-            gaussians when the bundle is made; docs/format.md states the error.
+            gaussians when the bundle is created; docs/format.md lists the errors.
 
     Raises:
         ValueError: The tables are inconsistent with each other or with the gaussians,
@@ -61,8 +62,8 @@ class Bundle:
         check_type("clusters", clusters, Clusters, "Clusters")
         check_type("groups", groups, Groups, "Groups")
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
-        # The tables are constructed again, because unpickled ones were not checked and
-        # their arrays are writable.
+        # The tables are constructed again, because tables that were unpickled have not
+        # been checked, and their arrays are writable.
         clusters = replace(clusters)
         groups = replace(groups)
         check_tables(clusters, groups, len(gaussians))
@@ -98,40 +99,40 @@ class Bundle:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
-        """Open a bundle file: read and check its header and tables, and leave the
-        gaussians on disk until they are used.
+        """Open a bundle file. Its header and tables are read and checked; its gaussians
+        stay on disk until they are used.
 
         The file stays open, so saving another file over it does not change this bundle.
-        With the extra `fsspec` the file may be at a URL; only the parts in use are
-        fetched, once per process.
+        With the extra `fsspec`, the file may be at a URL. Only the parts that are used
+        are downloaded, once per process.
 
         Raises:
             FileNotFoundError: The file does not exist.
-            ValueError: It is not a bundle, is of a newer version, or is damaged; the
-                message names the file and the field. Damage in the gaussians is
-                detected when they are read.
+            ValueError: The file is not a bundle, has a newer version, or is damaged;
+                the message names the file and the field. Damaged gaussians are detected
+                when they are read.
         """
         return cls.open_all([in_parts(path)])[0]
 
     @classmethod
     def open_all(cls, paths: Iterable[str | os.PathLike[str]]) -> list[Bundle]:
-        """Open several bundle files concurrently, each as `open` does.
+        """Open several bundle files concurrently; see `open`.
 
         Raises:
-            FileNotFoundError, ValueError: See `open`; the error concerns the first
-                wrong file.
+            FileNotFoundError, ValueError: See `open`. If several files are invalid, the
+                error is that of the first one.
         """
         reader = _core.HashedReader()
         paths = list(paths)
         try:
-            # More threads than processors are useful, because a disk serves several
-            # requests at a time.
+            # More threads than processors are useful, because disks process several
+            # requests at once.
             return on_threads(
                 lambda path: cls._open(BundleFile(path, reader)), paths, max_threads=8
             )
         except (OSError, ValueError):
             for path in paths[:-1]:
-                cls.open_all([path])  # raises the error of an earlier file, if it has one
+                cls.open_all([path])  # raises the error of this file if it is invalid
             raise
 
     @classmethod
@@ -141,7 +142,8 @@ class Bundle:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
-            # This is checked before any size is derived from the number.
+            # This must be checked before any size is computed from the number of
+            # gaussians.
             max_gaussians = file.pages_bytes // file.codec.gaussian_bytes
             expected = f"at most {max_gaussians} gaussians, got {num_gaussians}"
             check("clusters.offset[-1]", num_gaussians <= max_gaussians, expected)
@@ -151,19 +153,20 @@ class Bundle:
             bundle = cls.__new__(cls)
             cls._set(bundle, clusters, groups, file.config, pages, file)
         except ValueError as error:
-            file.verify()  # wrong tables are mostly due to damage, which this reports instead
+            # Inconsistent tables are mostly due to damage; then this raises the error.
+            file.verify()
             raise ValueError(f"{file.path}: {error}") from None
-        file.verify()  # after the checks, because the tables are hashed meanwhile
+        file.verify()  # last, because the tables are hashed while they are checked
         return bundle
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the bundle to a file; the same bundle gives the same bytes.
+        """Write the bundle to a file. Equal bundles give the same bytes.
 
         The file appears at ``path`` only when it is complete. After an error or an
         interrupt, an existing file is unchanged, and no temporary file remains.
 
         Raises:
-            ValueError: The name does not end in `.v3dg`, or names a device or a pipe.
+            ValueError: The name does not end in `.v3dg`, or it is a device or a pipe.
             OSError: The file cannot be written.
         """
         _files.check_bundle_name(path)
@@ -179,8 +182,8 @@ class Bundle:
             plan.write_header(file.fileno())
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        """Pickle a bundle in memory completely, and a bundle in a file as its path,
-        which the copy opens."""
+        """Pickle a bundle in memory completely. A bundle in a file is pickled as its
+        path; unpickling opens the file."""
         path = self.path
         if path is not None:
             if not is_url(path):
@@ -190,18 +193,17 @@ class Bundle:
 
     @property
     def clusters(self) -> Clusters:
-        """C clusters."""
+        """The table of all clusters."""
         return self._clusters
 
     @property
     def groups(self) -> Groups:
-        """G groups."""
+        """The table of all groups."""
         return self._groups
 
     @property
     def path(self) -> str | None:
-        """Name or complete URL of the file that the bundle was opened from; None for a
-        bundle in memory."""
+        """Name or complete URL of the bundle's file; None for a bundle in memory."""
         if self._file is None:
             return None
         return self._file.name
@@ -215,13 +217,13 @@ class Bundle:
 
     @property
     def num_pages(self) -> int:
-        """Number of pages: page g has the clusters that group g replaces, the last page
-        has the last level."""
+        """Number of pages. Page g contains the clusters that group g replaces; the last
+        page contains the last level."""
         return self._layout.num_pages
 
     @property
     def num_gaussians(self) -> int:
-        """Number of gaussians in all levels."""
+        """Number of gaussians in all levels together."""
         return int(self.clusters.offset[-1])
 
     def __repr__(self) -> str:
@@ -234,31 +236,31 @@ class Bundle:
         )
 
     def _repr_html_(self) -> str:
-        """Return a summary and a table of the levels, for notebooks."""
+        """Return a summary and a table of the levels as HTML, for notebooks."""
         names = ("level", "clusters", "gaussians", "bytes")
         rows = [names, *([f"{level[name]:,}" for name in names] for level in self.info()["levels"])]
         cells = "".join(f"<tr><td>{'<td>'.join(row)}" for row in rows)
         return f"<p>{html.escape(repr(self))}<table>{cells}</table>"
 
     def level_range(self, level: int) -> range:
-        """Return the ids of the clusters of one level."""
+        """Return the indices of the clusters in a level."""
         check_index("level", level, self.num_levels)
         first, last = np.searchsorted(self.clusters.level, [level, level + 1])
         return range(int(first), int(last))
 
     def page_range(self, page: int) -> range:
-        """Return the ids of the clusters of one page."""
+        """Return the indices of the clusters in a page."""
         check_index("page", page, self.num_pages)
         first = self._layout.first_cluster
         return range(int(first[page]), int(first[page + 1]))
 
     @property
     def gaussians(self) -> Gaussians:
-        """All gaussians, in the order of the clusters; read and verified on first use,
-        then cached.
+        """All gaussians, in the order of the clusters. They are read and verified on
+        first use, and then cached.
 
-        A quantised bundle caches its codes instead: each use decodes them to new
-        arrays.
+        A quantised bundle caches its codes instead, and decodes them to new arrays on
+        each use.
         """
         pages = self._in_memory()
         if isinstance(pages, MemoryPages):
@@ -267,8 +269,8 @@ class Bundle:
 
     @property
     def codes(self) -> _core.Codes | None:
-        """All codes of a quantised bundle, for the compiled operations; read, verified
-        and cached."""
+        """All codes of a quantised bundle, for the compiled operations. They are read
+        and verified on first use, and then cached."""
         if self.codec == Codec.name:
             return None
         pages = self._in_memory()
@@ -282,7 +284,7 @@ class Bundle:
 
     @property
     def page_bytes(self) -> int:
-        """Total size of all pages, in memory and in the file."""
+        """Total size of all pages in bytes, in memory and in the file."""
         return int(self._layout.page_bytes(self._codec).sum())
 
     @property
@@ -292,15 +294,15 @@ class Bundle:
 
     @property
     def page_source(self) -> _core.Rows | _core.FileSource:
-        """The source of single pages for the core: the file, or all gaussians if
-        they are in memory."""
+        """The source from which the core reads single pages: the file, or the gaussians
+        if they are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):
             return self.gaussians.rows
         return self._file.source
 
     def read_page(self, page: int) -> Gaussians:
-        """Return the gaussians of the clusters that share parent group ``page``, or of
-        the last level; verified."""
+        """Return the gaussians of a page, after verifying its hash. Page g contains the
+        clusters that group g replaces; the last page contains the last level."""
         check_index("page", page, self.num_pages)
         return self._pages.read(page, page + 1)
 
@@ -315,8 +317,9 @@ class Bundle:
         return self.read_page(page).subset(slice(start, stop))
 
     def level_gaussians(self, level: int) -> Gaussians:
-        """Return the gaussians of one level; reads only the pages of that level. Those
-        of level 0 are antialiased if the asset is."""
+        """Return the gaussians of a level; only the pages of that level are read. The
+        gaussians of level 0 have `antialiased` set if the asset was trained with
+        antialiasing."""
         clusters = self.level_range(level)
         first, last = np.searchsorted(self._layout.first_cluster, [clusters.start, clusters.stop])
         gaussians = self._pages.read(int(first), int(last))
@@ -326,8 +329,8 @@ class Bundle:
         return gaussians
 
     def info(self) -> JsonObject:
-        """Return a description of the bundle as JSON values, without reading gaussians;
-        sizes are those of its file."""
+        """Return a description of the bundle as a JSON object, without reading
+        gaussians. Sizes are those of its file."""
         page_level = self.clusters.level[self._layout.first_cluster[:-1]]
         page_sizes = self._layout.page_bytes(self._codec)
         sizes = [int(page_sizes[page_level == level].sum()) for level in range(self.num_levels)]
@@ -385,19 +388,22 @@ def _check_page_tables(pages: FilePages, file: BundleFile) -> None:
     for name, expected in page_tables(pages.layout, pages.codec).items():
         values = file.tables[name]
         check_all(
-            name, values, values == expected, lambda row, e=expected: f"{e[row]} for its clusters"
+            name,
+            values,
+            values == expected,
+            lambda row, e=expected: f"{e[row]}, which follows from the clusters",
         )
     total = int(pages.layout.page_bytes(pages.codec).sum())
     check(
         "pages",
         total == file.pages_bytes,
-        f"{total} bytes for the gaussians, got {file.pages_bytes}",
+        f"{total} bytes for all gaussians, got {file.pages_bytes}",
     )
 
 
 def _mean_of_known(values: NDArray[np.float32]) -> float | None:
-    """Return the mean without NaN, which means unknown; None if all values are
-    unknown."""
+    """Return the mean of all values that are not NaN, which means unknown; None if all
+    are NaN."""
     numbers = values[~np.isnan(values)]
     if not numbers.size:
         return None

@@ -1,6 +1,6 @@
-"""Codecs, which define the bytes of a page.
+"""Codecs, which define how the gaussians of a page are stored as bytes.
 
-Pages are encoded here and decoded in the core, which has a `PageCodec` for each codec
+Pages are encoded here. The core decodes them, with one `PageCodec` for each codec
 (csrc/residency/page_source.h). docs/extending.md describes how to add a codec.
 """
 
@@ -16,17 +16,19 @@ from v3dg.gaussians import Gaussians, empty, gaussian_bytes
 
 
 class Codec:
-    """The codec "float32": a page has the float32 arrays of its gaussians, one after
-    another; all gaussians have one SH degree.
+    """The codec "float32": a page contains the float32 arrays of its gaussians, one
+    after another. All gaussians have the same SH degree.
 
     Attributes:
-        name: The name for users and in files.
-        alignment: A page begins in the file at a multiple of this number of bytes.
-        gaussian_bytes, cluster_bytes: Bytes of a page per gaussian and per cluster.
+        name: The name in the API and in files.
+        alignment: Pages begin at multiples of this number of bytes in the file.
+        gaussian_bytes, cluster_bytes: Size of a page in bytes for each gaussian and
+            each cluster.
     """
 
     name: ClassVar[str] = "float32"
-    # The size of a memory page, so that the system can map or load pages directly.
+    # This is the size of a memory page, so that the operating system can map or load
+    # pages directly.
     alignment: int = 4096
 
     def __init__(self, sh_degree: int) -> None:
@@ -37,31 +39,31 @@ class Codec:
     def page_bytes(
         self, num_gaussians: NDArray[np.int64], num_clusters: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Return the sizes of pages with these numbers of gaussians and clusters,
-        including padding."""
+        """Return the sizes of pages in bytes, including padding, given their numbers of
+        gaussians and clusters."""
         num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
         return (num_bytes + self.alignment - 1) & -self.alignment  # the alignment is a power of two
 
     def encode(
         self, gaussians: Gaussians, offset: NDArray[np.int64]
     ) -> Sequence[NDArray[np.generic]]:
-        """Return the page of the clusters that begin at these rows, as arrays to be
-        concatenated."""
+        """Return the bytes of a page as arrays to be concatenated. `offset` has the
+        first row of each of its clusters, and the end."""
         return [array[offset[0] : offset[-1]] for array in vars(gaussians).values()]
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
-        """Return the gaussians of these clusters after encoding and decoding, on their
-        device."""
+        """Return the gaussians after encoding and decoding, on their device. `offset`
+        has the first row of each cluster, and the end."""
         return gaussians
 
     def empty(self, count: int) -> Gaussians:
-        """Return uninitialised gaussians on the host, to decode into."""
+        """Return uninitialised gaussians on the host, into which pages are decoded."""
         return empty(count, self.sh_degree)
 
 
 class Quantized(Codec):
-    """Codes of 16 bytes, and up to 24 more for the higher degrees, relative to the
-    ranges of a cluster."""
+    """The codec "quantized": codes relative to the ranges of a cluster, with 16 bytes
+    per gaussian, and up to 24 more for higher SH degrees."""
 
     name = "quantized"
 
@@ -85,6 +87,6 @@ CODECS: dict[str, type[Codec]] = {codec.name: codec for codec in (Codec, Quantiz
 
 
 def codec_of(name: str, sh_degree: int) -> Codec:
-    """Return the codec of that name; raise ValueError if there is none."""
+    """Return the codec with a name; raise ValueError if there is none."""
     one_of(name, "codec", tuple(CODECS))
     return CODECS[name](sh_degree)

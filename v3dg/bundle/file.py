@@ -1,9 +1,9 @@
-"""The file of a bundle: a safetensors container with aligned, hashed pages in front of
-the tables.
+"""Reads and writes the file of a bundle: a safetensors container with aligned and
+hashed pages, followed by the tables.
 
-docs/format.md describes the content of the file and the reasons. This module reads and
-writes bytes and trusts none of them; `v3dg.bundle.tables` checks the values of the
-tables.
+docs/format.md describes the format and the reasons for it. This module checks the
+structure of the file, because the file may be hostile; `v3dg.bundle.tables` checks the
+values in the tables.
 """
 
 import os
@@ -34,16 +34,18 @@ from v3dg.bundle.pages import PageLayout, PageRun, on_threads
 from v3dg.bundle.tables import Clusters, Column, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
-_FIRST_BYTES = 4096  # first bytes of the header, which a disk writes atomically
-# The limit for tables at a URL, whose size is only a claim until they are fetched. The
-# tables of a billion gaussians are smaller.
+# Size of the beginning of the header, which a disk writes atomically.
+_FIRST_BYTES = 4096
+# Maximum size of the tables of a file at a URL, because their size is only a claim
+# until they are downloaded. The tables of a billion gaussians are smaller.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
-_FREE_CLUSTERS = 1 << 18  # number of clusters that may be empty; every further one has a gaussian
+# Number of clusters that may be empty; each further cluster has at least one gaussian.
+_FREE_CLUSTERS = 1 << 18
 
 
 class BundlePlan:
-    """The positions of all parts of a bundle's file, which follow from the layout, the
-    codec and the config."""
+    """The positions of all parts in the file of a bundle. They follow from the page
+    layout, the codec and the config."""
 
     def __init__(self, layout: PageLayout, codec: Codec, config: JsonObject) -> None:
         self.layout = layout
@@ -62,14 +64,14 @@ class BundlePlan:
         )
 
     def run(self, first_page: int, last_page: int) -> PageRun:
-        """Return a run of the pages."""
+        """Return pages `first_page` to `last_page` with their positions in the file."""
         return self.layout.run(first_page, last_page, self._places)
 
     def write_tables(
         self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
     ) -> None:
-        """Check the tables and write them behind the pages, which have (P, 16)
-        hashes."""
+        """Check the tables and write them behind the pages; `hashes` (P, 16) are those
+        of the pages."""
         check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
         tables = self._page_tables | columns_of(clusters, groups) | {"pages.hash": hashes}
         schema = schema_of(self.codec)
@@ -81,8 +83,8 @@ class BundlePlan:
         _files.write_at(descriptor, end, self._pages_end)
 
     def write_header(self, descriptor: int) -> None:
-        """Write the header. Its first bytes are written last, so a file that contains
-        them is complete."""
+        """Write the header. Its first bytes are written last, so a file that begins
+        with them is complete."""
         _files.write_at(descriptor, self.header[_FIRST_BYTES:], _FIRST_BYTES)
         _files.write_at(descriptor, self.header[:_FIRST_BYTES], 0)
 
@@ -90,8 +92,8 @@ class BundlePlan:
 def write_pages(
     descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians
 ) -> NDArray[np.uint8]:
-    """Write the gaussians of a run of pages, on any device, at their position; return
-    (n, 16) their hashes."""
+    """Write the gaussians of neighbouring pages, which may be on any device, at their
+    positions in the file. Return (n, 16) the hashes of the pages."""
     host = gaussians.numpy()
     sizes = np.diff(run.places)
     hashes = np.empty((len(run), HASH_BYTES), np.uint8)
@@ -113,8 +115,8 @@ def read_pages(
     codec: Codec,
     hashes: NDArray[np.uint8],
 ) -> Gaussians:
-    """Return the gaussians of a run of pages; raise ValueError if they are missing or
-    have other hashes."""
+    """Return the gaussians of neighbouring pages; raise ValueError if the file is too
+    short or a hash differs."""
     result = codec.empty(run.rows.stop - run.rows.start)
     _core.read_pages(
         os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], run.core
@@ -123,15 +125,15 @@ def read_pages(
 
 
 class BundleFile:
-    """A bundle file whose header and tables were read, but none of its pages; `verify`
-    checks header and tables for damage.
+    """An open bundle file. Its header and tables are read at once, and its pages on
+    demand; `verify` checks the hash of header and tables.
 
-    Memory is allocated only up to the size of the file or, for a URL, up to the number
-    of fetched bytes. The file is closed when this object is destroyed.
+    Never more memory is allocated than the size of the file or, for a URL, the number
+    of downloaded bytes. The file is closed when this object is destroyed.
 
     Attributes:
-        name: The file's name, or its URL, as the caller passed it.
-        path: The name that messages use.
+        name: The name of the file, or its complete URL.
+        path: The name of the file in messages, without secret parts of a URL.
     """
 
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
@@ -162,17 +164,20 @@ class BundleFile:
             self.num_bytes = self._at_url.num_bytes
         else:
             self.num_bytes = os.fstat(self._fd).st_size
-        check(self.path, self.num_bytes >= 8, f"a bundle, got a file of {self.num_bytes} bytes")
+        check(
+            self.path, self.num_bytes >= 8, f"a bundle, got a file of only {self.num_bytes} bytes"
+        )
         header_bytes = int.from_bytes(self._read(8, 0), "little")
         check(
             self.path,
             header_bytes > 0,
-            "a bundle, got one that is not finished, or another kind of file",
+            "a bundle, got an unfinished one or another kind of file; build it again",
         )
         fits = header_bytes <= min(self.num_bytes - 8, file_format.MAX_HEADER_BYTES)
         problem = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
         expected = (
-            f"a bundle (safetensors), got {problem}; it is truncated, or no bundle: see v3dg.open"
+            f"a bundle (safetensors), got {problem}; the file is truncated or no bundle, see "
+            "v3dg.open"
         )
         self._check("header", fits, expected)
         text = header_bytes.to_bytes(8, "little") + self._read(header_bytes, 8)
@@ -190,14 +195,15 @@ class BundleFile:
         kind = values.get("format")
         if kind != file_format.FORMAT:
             self._fail(
-                f"format: expected '{file_format.FORMAT}', got {json_text(kind)}; not a bundle"
+                f"format: expected '{file_format.FORMAT}', got {json_text(kind)}; the file is not "
+                "a bundle"
             )
         version = values.get("version")
         if not isinstance(version, str) or not re.fullmatch("[1-9][0-9]{0,8}", version):
-            self._fail(f"version: expected a number of 1 or more, got {json_text(version)}")
+            self._fail(f"version: expected an integer of at least 1, got {json_text(version)}")
         self.version = int(version)
         if self.version > VERSION:
-            self._fail(f"version {self.version}, this build reads up to {VERSION}; update v3dg")
+            self._fail(f"version: expected at most {VERSION}, got {self.version}; update v3dg")
         degree = values.get("sh_degree")
         if not isinstance(degree, str) or degree not in ("0", "1", "2", "3"):
             self._fail(f"sh_degree: expected '0' to '3', got {json_text(degree)}")
@@ -209,13 +215,11 @@ class BundleFile:
             or name not in CODECS
             or (self.version, name) == (2, Codec.name)
         ):
-            self._fail(
-                f"codec: expected one that this build reads, got {json_text(name)}; update v3dg"
-            )
+            self._fail(f"codec: expected a known codec, got {json_text(name)}; update v3dg")
         self.codec = CODECS[name](int(degree))
         config = values.get("config")
         if not isinstance(config, str):
-            self._fail(f"config: expected a string of JSON, got {json_text(config)}")
+            self._fail(f"config: expected JSON in a string, got {json_text(config)}")
         self.config = self._object("config", config)
 
     def _object(self, name: str, text: str | bytes) -> JsonObject:
@@ -227,8 +231,8 @@ class BundleFile:
         return dict(value)
 
     def _check_entries(self, header: JsonObject) -> dict[str, Entry]:
-        """Compare the header with the one that follows from its own counts and the
-        file's size."""
+        """Compare the header with the header that follows from its own counts and the
+        size of the file; return its entries."""
         counts = []
         for name in ("clusters.level", "groups.parent", "pages.offset", "pages"):
             entry = header.get(name)
@@ -238,8 +242,8 @@ class BundleFile:
             counts.append(length)
         largest = max(counts)
         text = (
-            f"more than {json_text(largest)} bytes for tensors, got {self.num_bytes}; "
-            "the file is truncated"
+            f"more than {json_text(largest)} bytes, as the tensors need, got {self.num_bytes}; the "
+            "file is truncated"
         )
         self._check("size", largest <= self.num_bytes, text)
         expected = entries_of(self.codec, *counts)
@@ -250,12 +254,15 @@ class BundleFile:
         unknown = sorted(set(header) - set(expected))
         if unknown:
             self._fail(
-                f"{json_text(unknown[0])}: expected only the tensors of version {self.version}"
+                f"{json_text(unknown[0])}: expected only tensors of version {self.version}, got "
+                "another one"
             )
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             is_aligned = value % self.codec.alignment == 0
             self._check(
-                name, is_aligned, f"to end at a multiple of {self.codec.alignment}, got {value}"
+                name,
+                is_aligned,
+                (f"to end at a multiple of {self.codec.alignment} bytes, got {value}"),
             )
         size = self._data_start + expected["hash"]["data_offsets"][1]
         problem = "followed by other data"
@@ -268,19 +275,25 @@ class BundleFile:
     def _check_counts(
         self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
     ) -> None:
-        """Raise ValueError for tables at a URL that are larger than the gaussians can
-        need, before fetching them."""
+        """Raise ValueError if the tables of a file at a URL are larger than its
+        gaussians can need; this is checked before the tables are downloaded."""
         if self._at_url is None:
             return
         limit = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
         self._check(
-            "clusters", num_clusters <= limit, f"at most {limit} for its pages, got {num_clusters}"
+            "clusters",
+            num_clusters <= limit,
+            (f"at most {limit} clusters for the size of its pages, got {num_clusters}"),
         )
         self._check(
-            "groups", num_groups <= num_clusters, f"at most {num_clusters}, got {num_groups}"
+            "groups",
+            num_groups <= num_clusters,
+            (f"at most {num_clusters}, the number of clusters, got {num_groups}"),
         )
         self._check(
-            "pages", num_pages <= num_groups + 1, f"at most {num_groups + 1}, got {num_pages}"
+            "pages",
+            num_pages <= num_groups + 1,
+            (f"at most {num_groups + 1}, one more than groups, got {num_pages}"),
         )
 
     def _read_tables(
@@ -290,23 +303,25 @@ class BundleFile:
         num_bytes = self.num_bytes - place
         is_small = self._at_url is None or num_bytes <= _MOST_FETCHED_TABLE_BYTES
         expected = (
-            f"at most {_MOST_FETCHED_TABLE_BYTES} bytes at a URL, got {num_bytes}; "
-            "fetch the file first"
+            f"at most {_MOST_FETCHED_TABLE_BYTES} bytes for a file at a URL, got {num_bytes}; "
+            "download the file first"
         )
         self._check("tables", is_small, expected)
         self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
-        data = self._reading.wait()  # the tables, followed by their hash
-        self.tables: dict[str, Column] = {}  # `schema_of` defines their types
+        # The tables, followed by the hash of header and tables.
+        data = self._reading.wait()
+        # `schema_of` defines the types of the columns.
+        self.tables: dict[str, Column] = {}
         for name, dtype, _, _ in schema_of(self.codec):
             first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
     def verify(self) -> None:
-        """Wait for the hash of header and tables, and compare it with the hash in the
-        file; raise ValueError if they differ."""
+        """Wait for the hash of the header and tables; raise ValueError if it differs
+        from the one in the file."""
         if not self._reading.is_sound():
-            self._fail(f"hash: the header and tables do not match it; {_core.DAMAGED}")
+            self._fail(f"hash: does not match the header and the tables; {_core.DAMAGED}")
         del self._reading
 
     def _read(self, num_bytes: int, offset: int) -> bytes:
@@ -314,13 +329,15 @@ class BundleFile:
         out = np.empty(num_bytes, np.uint8)
         if not _files.read_at(self._fd, out, offset):
             self._fail(
-                f"size: expected bytes at {offset}, got the end of the file; it was truncated"
+                f"size: expected more bytes after offset {offset}, got the end of the file; it was "
+                "truncated"
             )
         return out.tobytes()
 
     @property
     def places(self) -> NDArray[np.int64]:
-        """(P+1,) first byte of each page in the file, and the end."""
+        """(P+1,) offset of the first byte of each page in the file, and the end of the
+        pages."""
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
     @property
@@ -340,16 +357,16 @@ class BundleFile:
         )
 
     def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
-        """Fill rows with the gaussians of a run of pages, or an integer array with
-        quantised pages; verified."""
+        """Read neighbouring pages and verify their hashes. `out` is filled with their
+        gaussians or, if it is an integer array, with their codes."""
         self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
         _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, run.core)
 
 
 def _length_of_vector(entry: object) -> int | None:
-    """Return the length of a one-dimensional tensor, given its entry in a header; None
-    for any other entry."""
+    """Return the length of a one-dimensional tensor from its header entry; None for any
+    other entry."""
     if not isinstance(entry, dict):
         return None
     shape = entry.get("shape")

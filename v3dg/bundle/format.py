@@ -1,5 +1,5 @@
-"""The parts of a bundle file: its tables, its header and its hashes. docs/format.md
-gives the reasons."""
+"""Defines the parts of a bundle file: tables, header and hashes. docs/format.md gives
+the reasons."""
 
 import hashlib
 import json
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from v3dg.bundle.pages import PageLayout
 
 FORMAT = "v3dg"
-VERSION = 3  # the newest version, which is the one that is written
+VERSION = 3  # the newest version; files are written in this version
 HASH_BYTES = 16
-# The header has 20 entries and the config; a longer header is damaged or malicious.
+# A header contains 20 entries and the config. A longer one is damaged or hostile.
 MAX_HEADER_BYTES = 1 << 20
 
 DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
     # Each row has a name, a safetensors dtype, the number of rows (C clusters, C+1, G
-    # groups, P pages), and the rest of the shape. The order is that of the file: wide
-    # types first, so that every table is aligned to its own type.
+    # groups, P pages), and the remaining shape. The order is that of the file: wide
+    # types come first, so that each table is aligned to its own type.
     ("clusters.offset", "I64", "C+1", ()),
     ("pages.offset", "I64", "P", ()),
     ("pages.bytes", "I64", "P", ()),
@@ -49,12 +49,13 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-# These tables are only in float32 files; for codes, they follow from the other tables.
+# These tables are only in float32 files. In quantised files, they would follow from the
+# other tables.
 _ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")
 
 
 class Entry(TypedDict):
-    """The header entry of a tensor, as in safetensors."""
+    """The entry of a tensor in the header, as defined by safetensors."""
 
     dtype: str
     shape: list[int]
@@ -67,8 +68,8 @@ def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
 
 
 def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.generic]]:
-    """Return the tables of the pages except the hashes; they follow from the clusters
-    of each page."""
+    """Return all tables of the pages except the hashes. They follow from the page
+    layout and the codec."""
     tables: dict[str, NDArray[np.generic]] = {
         "pages.offset": offset_of(layout.page_bytes(codec))[:-1],
         "pages.bytes": np.diff(layout.first_gaussian) * codec.gaussian_bytes,
@@ -79,13 +80,13 @@ def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.ge
 
 
 def offset_of(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (N + 1,) the start of each of N consecutive parts, and the end of the last
-    one."""
+    """Return (N + 1,) the start of each of N consecutive parts of these sizes, and the
+    end of the last part."""
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
 
 
 def page_hash(pieces: Iterable[NDArray[np.generic]]) -> bytes:
-    """Return the BLAKE2b-128 of the concatenated bytes of the pieces."""
+    """Return the BLAKE2b-128 hash of the concatenated bytes of arrays."""
     digest = hashlib.blake2b(digest_size=HASH_BYTES)
     for piece in pieces:
         digest.update(piece.reshape(-1).view(np.uint8).data)
@@ -93,8 +94,8 @@ def page_hash(pieces: Iterable[NDArray[np.generic]]) -> bytes:
 
 
 def hash_of_pieces(message: bytes) -> bytes:
-    """Return the BLAKE2b-128 of the digests of the message's pieces, which are hashed
-    in parallel."""
+    """Return the BLAKE2b-128 hash of a message: the message is split into pieces, which
+    are hashed in parallel, and the result is the hash of their hashes."""
     data = np.frombuffer(message, np.uint8)
     size = _core.HASH_PIECE_BYTES
     digests = _core.blake2b(np.split(data, range(size, len(data), size)))
@@ -104,8 +105,8 @@ def hash_of_pieces(message: bytes) -> bytes:
 def entries_of(
     codec: "Codec", num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
 ) -> dict[str, Entry]:
-    """Return the entries of the header: dtype, shape and position of every tensor of
-    the file, in file order."""
+    """Return the entries of the header: dtype, shape and position of each tensor, in
+    the order of the file."""
     num_rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
     tensors = [("pages", "U8", [pages_bytes])]
     for name, dtype, rows, row_shape in schema_of(codec):
@@ -121,11 +122,11 @@ def entries_of(
 
 
 def header_of(entries: dict[str, Entry], codec: "Codec", config: JsonObject) -> bytes:
-    """Return the length and the JSON of the header, padded with spaces so that the data
-    starts aligned.
+    """Return the header: its length and its JSON, padded with spaces so that the data
+    is aligned.
 
     Raises:
-        ValueError: The config is so long that the header exceeds its limit.
+        ValueError: The config is so long that the header exceeds `MAX_HEADER_BYTES`.
     """
     metadata = {
         "format": FORMAT,
@@ -138,7 +139,7 @@ def header_of(entries: dict[str, Entry], codec: "Codec", config: JsonObject) -> 
         {"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")
     ).encode()
     text += b" " * (-(8 + len(text)) % codec.alignment)
-    expected = f"at most {MAX_HEADER_BYTES} bytes of JSON in the header that contains it"
+    expected = f"at most {MAX_HEADER_BYTES} bytes of JSON in the header, which includes it"
     check("config", len(text) <= MAX_HEADER_BYTES, f"{expected}, got {len(text)}; shorten it")
     return len(text).to_bytes(8, "little") + text
 
@@ -150,4 +151,4 @@ def config_to_json(config: JsonObject) -> str:
     try:
         return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"config: expected values that JSON can hold, got {error}") from None
+        raise ValueError(f"config: expected values that JSON can represent, got {error}") from None

@@ -1,5 +1,5 @@
-"""Pages: the clusters of each, and the sources of their gaussians. codec.py defines the
-bytes of a page."""
+"""Pages: the clusters of each page, and the sources of their gaussians. codec.py
+defines the bytes of a page."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -28,16 +28,16 @@ _MAX_THREADS = min(8, os.cpu_count() or 1)
 
 @dataclass(frozen=True, eq=False)
 class PageLayout:
-    """P pages in file order: page g has the clusters that group g replaces, the last
-    page has the last level."""
+    """The division of all clusters into P pages. Page g contains the clusters that
+    group g replaces; the last page contains the last level."""
 
-    # (P+1,) first cluster of each page, and the number of clusters.
+    # (P+1,) index of the first cluster of each page, and the number of clusters.
     first_cluster: NDArray[np.int64]
-    offset: NDArray[np.int64]  # (C+1,) boundaries of the clusters' gaussians
+    offset: NDArray[np.int64]  # (C+1,) boundaries of the gaussians of clusters
 
     @staticmethod
     def of(clusters: Clusters) -> "PageLayout":
-        """Return the pages of clusters; clusters that share a parent group must be
+        """Return the pages of clusters. Clusters with the same parent group must be
         neighbours."""
         parent = clusters.parent_group
         starts = np.flatnonzero(parent[1:] != parent[:-1]) + 1
@@ -49,7 +49,8 @@ class PageLayout:
 
     @cached_property
     def first_gaussian(self) -> NDArray[np.int64]:
-        """(P+1,) first gaussian of each page, and the number of gaussians."""
+        """(P+1,) index of the first gaussian of each page, and the number of
+        gaussians."""
         return self.offset[self.first_cluster]
 
     @property
@@ -62,12 +63,12 @@ class PageLayout:
         return self.offset[self.first_cluster[page] : self.first_cluster[page + 1] + 1]
 
     def page_bytes(self, codec: Codec) -> NDArray[np.int64]:
-        """Return (P,) the size of each page, including padding."""
+        """Return (P,) the size of each page in bytes, including padding."""
         return codec.page_bytes(np.diff(self.first_gaussian), np.diff(self.first_cluster))
 
     def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> "PageRun":
-        """Return a run of the pages; ``places`` has the first byte of every page in a
-        file, and the end."""
+        """Return pages `first_page` to `last_page`. ``places`` has the offset of each
+        page in a file, and the end of the last page."""
         clusters = self.first_cluster[first_page : last_page + 1]
         return PageRun(
             first_page=first_page,
@@ -79,22 +80,22 @@ class PageLayout:
 
 @dataclass(frozen=True, eq=False)
 class PageRun:
-    """Neighbouring pages: their clusters, the rows of their gaussians and their
-    position in the file."""
+    """Neighbouring pages: their clusters, the rows of their gaussians, and their
+    positions in a file."""
 
     first_page: int  # index of the first page in the bundle
-    # (n+1,) first cluster of each page, counted in the run, and the end.
+    # (n+1,) first cluster of each page, counted from the first one here, and the end.
     first_cluster: NDArray[np.int64]
-    # Boundaries of the gaussians of the run's clusters, as indices in the bundle.
+    # Boundaries of the gaussians of all clusters, as indices in the bundle.
     offset: NDArray[np.int64]
-    places: NDArray[np.int64]  # (n+1,) first byte of each page in the file, and the end
+    places: NDArray[np.int64]  # (n+1,) offset of each page in the file, and the end
 
     def __len__(self) -> int:
         return len(self.places) - 1
 
     @property
     def core(self) -> _core.PageRun:
-        """The run for the compiled operations."""
+        """The pages for the compiled operations."""
         return _core.PageRun(
             first_page=self.first_page,
             first_cluster=self.first_cluster,
@@ -104,18 +105,18 @@ class PageRun:
 
     @property
     def rows(self) -> slice:
-        """Their rows of gaussians in the bundle."""
+        """The rows of all gaussians in the bundle."""
         return slice(int(self.offset[0]), int(self.offset[-1]))
 
     def clusters_of(self, number: int) -> NDArray[np.int64]:
-        """Return the boundaries of the gaussians of one page's clusters, as indices in
-        the bundle; `number` counts in the run."""
+        """Return the boundaries of the gaussians of one page's clusters, relative to
+        the first gaussian of all pages here. `number` is the index of the page here."""
         first, last = self.first_cluster[number : number + 2].tolist()
         return np.asarray(self.offset[first : last + 1] - self.offset[0])
 
 
 class MemoryPages:
-    """Pages of float32, all of whose gaussians are in memory on the host."""
+    """The pages of a bundle whose float32 gaussians are all in memory."""
 
     def __init__(self, layout: PageLayout, gaussians: Gaussians, codec: Codec) -> None:
         self.layout = layout
@@ -123,14 +124,15 @@ class MemoryPages:
         self.codec = codec
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Return the gaussians of a run of pages; they share memory with
+        """Return the gaussians of neighbouring pages. They share memory with
         `gaussians`."""
         first, last = self.layout.first_gaussian[[first_page, last_page]].tolist()
         return self.gaussians.subset(slice(first, last))
 
 
 class CodePages:
-    """Quantised pages, all of whose codes are in memory; they are decoded on demand."""
+    """The pages of a quantised bundle whose codes are all in memory; gaussians are
+    decoded on demand."""
 
     def __init__(self, layout: PageLayout, words: NDArray[np.int32], codec: Codec) -> None:
         self.layout = layout
@@ -140,7 +142,7 @@ class CodePages:
     @staticmethod
     def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> "CodePages":
         """Return the pages of gaussians on the host."""
-        places = offset_of(layout.page_bytes(codec) // 4)  # in units of 32-bit integers
+        places = offset_of(layout.page_bytes(codec) // 4)  # counted in 32-bit integers
         words = np.empty(int(places[-1]), np.int32)
 
         def encode(page: int) -> None:
@@ -151,24 +153,26 @@ class CodePages:
         return CodePages(layout, words, codec)
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Return the gaussians of a run of pages."""
+        """Return the gaussians of neighbouring pages."""
         clusters = np.arange(*self.layout.first_cluster[[first_page, last_page]], dtype=np.int32)
         return Gaussians(*_core.Model(self.codes, CPU.number).decode(clusters))
 
 
 class FilePages:
-    """Pages that are read from a file on demand; the page that was last read alone is
-    cached."""
+    """Pages that are read from a file on demand. The most recent page that was read
+    alone is cached."""
 
     def __init__(self, layout: PageLayout, file: "BundleFile") -> None:
         self.layout = layout
         self.codec = file.codec
         self._file = file
-        # The tuple is replaced as a whole, because threads read it without a lock.
+        # The tuple is always replaced as a whole, because threads read it without a
+        # lock.
         self._last_page: tuple[int, Gaussians | None] = (-1, None)
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Return the gaussians of a run of pages, on the host; verified."""
+        """Return the gaussians of neighbouring pages on the host, after verifying their
+        hashes."""
         cached_page, cached = self._last_page
         if first_page == cached_page == last_page - 1 and cached is not None:
             return cached
@@ -195,8 +199,7 @@ class FilePages:
 def on_threads(
     work: Callable[[_Item], _Result], items: Sequence[_Item], max_threads: int = _MAX_THREADS
 ) -> list[_Result]:
-    """Return the results of ``work`` for all items; several items are computed by
-    several threads."""
+    """Return the results of ``work`` for all items, which several threads compute."""
     if len(items) < 2:
         return list(map(work, items))
     with ThreadPoolExecutor(max_threads) as pool:
@@ -206,8 +209,8 @@ def on_threads(
 def runs_of_pages(
     first_page: int, last_page: int, page_bytes: NDArray[np.int64], num_bytes: int
 ) -> Iterator[range]:
-    """Split a run of pages into runs of about ``num_bytes``, which limits the memory
-    for one run."""
+    """Split a range of pages into smaller ranges of about ``num_bytes`` each, which
+    limits the memory for one of them."""
     ends = np.cumsum(page_bytes[first_page:last_page]) // num_bytes
     cuts = (np.flatnonzero(np.diff(ends)) + first_page + 1).tolist()
     for start, stop in zip([first_page, *cuts], [*cuts, last_page], strict=True):

@@ -1,4 +1,4 @@
-"""The tables of a bundle, which selection reads, and the checks that guarantee an exact
+"""The tables of a bundle that selection reads, and the checks that guarantee an exact
 cut."""
 
 from dataclasses import dataclass, replace
@@ -12,28 +12,29 @@ from v3dg._numbers import check, check_type, refuse, value_text, whole_number
 from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
 
-Column: TypeAlias = NDArray[Any]  # `bundle.format.SCHEMA` has its dtype
+Column: TypeAlias = NDArray[Any]  # the dtype is defined by `bundle.format.SCHEMA`
 
 NESTING_MARGIN = _core.nesting_margin
-"""The relative margin by which a group's ball contains the balls of the groups below
-it; see docs/format.md."""
+"""The relative margin that is added to a group's ball so that, in spite of rounding, it
+contains the balls of the groups below; see docs/format.md."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """C clusters, by level (0 first), then by position in the split tree; the arrays
-    are read-only.
+    """The table of C clusters, sorted by level (0 first) and then by position in the
+    tree of the median split. The arrays are read-only.
 
     Attributes:
-        offset: (C+1,) int64. Cluster c has gaussians offset[c] to offset[c+1].
-        level: (C,) int32.
+        offset: (C+1,) int64. Cluster c contains gaussians offset[c] to offset[c+1] - 1.
+        level: (C,) int32. Level of the cluster.
         own_group: (C,) int32. Group that made the cluster; -1 at level 0.
         parent_group: (C,) int32. Group that replaces the cluster; -1 at the last level.
-        box: (C,2,3) float32. Lower and upper corner of the cluster's visible extent, in
-            the asset's frame, without the reach of the filter.
-        filter_px2: (C,) float32. Variance of the cluster's low-pass filter on the
-            screen. In a fade, level 0 has a filter, too.
-        antialiased: (C,) uint8. 1 if opacity is compensated for the filter.
+        box: (C,2,3) float32. Minimum and maximum corner of the cluster's visible extent
+            in the asset's frame, without the extent that the filter adds.
+        filter_px2: (C,) float32. Variance of the cluster's screen-space low-pass
+            filter, px². With a fade, clusters of level 0 are drawn with a filter even
+            if this is 0.
+        antialiased: (C,) uint8. 1 if opacities are compensated for the filter.
     """
 
     offset: NDArray[np.int64]
@@ -51,7 +52,7 @@ class Clusters:
         return len(self.level)
 
     def around(self, gaussians: Gaussians) -> "Clusters":
-        """Return these clusters with the boxes of other gaussians; boxes of empty
+        """Return these clusters with boxes around other gaussians. The boxes of empty
         clusters do not change."""
         has_gaussians = np.diff(self.offset)[:, None, None] > 0
         box = np.where(has_gaussians, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)
@@ -60,18 +61,19 @@ class Clusters:
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """G groups, in the order of the clusters that they replace, and therefore by level;
-    the arrays are read-only.
+    """The table of G groups, in the order of the clusters that they replace, and
+    therefore sorted by level. The arrays are read-only.
 
     Attributes:
-        ball: (G,4) float32. Centre and radius in the asset's frame; contains the balls
-            of the groups below.
+        ball: (G,4) float32. Centre and radius, in the asset's frame, of a ball that
+            contains the balls of the groups below.
         weight: (G,) float32. One over the number of gaussians that the group was
-            simplified to, at least the largest weight below.
-        parent: (G,) int32. Group above; -1 for the groups that made the last level.
-        level: (G,) int32. Level of the clusters that the group makes; 1 or more.
-        error: (G,2) float32. Final residual of the fit in colour and alpha; NaN if it
-            is unknown.
+            simplified to, but at least the largest weight of the groups below.
+        parent: (G,) int32. The group above; -1 for groups that made clusters of the
+            last level.
+        level: (G,) int32. Level of the clusters that the group made; at least 1.
+        error: (G,2) float32. Remaining errors of the fit in colour and alpha; NaN if
+            unknown.
     """
 
     ball: NDArray[np.float32]
@@ -93,8 +95,8 @@ def check_index(name: str, index: int, count: int) -> None:
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
-    """Check dtypes and shapes, and replace writable arrays by read-only copies, so that
-    the checks stay valid."""
+    """Check dtypes and shapes. Replace writable arrays by read-only copies, so that
+    later changes cannot invalidate the checks."""
     count = np.size(part.level)
     for name, kind, rows, row_shape in [
         column for column in SCHEMA if column[0].startswith(prefix)
@@ -105,8 +107,12 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
         num_rows = count + (rows == "C+1")
         shape = (num_rows, *row_shape)
         if array.dtype != dtype or array.shape != shape:
-            refuse(name, f"{dtype} {shape}, got {array.dtype} {array.shape}")
-        check(name, array.flags.c_contiguous, "a C-contiguous array; use np.ascontiguousarray")
+            refuse(name, f"dtype {dtype} and shape {shape}, got {array.dtype} and {array.shape}")
+        check(
+            name,
+            array.flags.c_contiguous,
+            "a C-contiguous array, got a strided one; call numpy.ascontiguousarray",
+        )
         if array.flags.writeable:
             copy = array.copy()
             copy.flags.writeable = False
@@ -114,14 +120,14 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
 
 
 def columns_of(clusters: Clusters, groups: Groups) -> dict[str, Column]:
-    """Return all tables by their names in files."""
+    """Return all columns of the tables, by their names in files."""
     columns = {f"clusters.{name}": array for name, array in vars(clusters).items()}
     columns.update({f"groups.{name}": array for name, array in vars(groups).items()})
     return columns
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:
-    """Raise ValueError unless the tables are consistent with each other and the
+    """Raise ValueError unless the tables are consistent with each other and with the
     gaussians, and guarantee an exact cut."""
-    check("clusters", len(clusters) < 1 << 31, f"fewer than 2^31, got {len(clusters)}")
+    check("clusters", len(clusters) < 1 << 31, f"fewer than 2^31 clusters, got {len(clusters)}")
     _core.check_tables(*columns_of(clusters, groups).values(), num_gaussians=num_gaussians)

@@ -1,5 +1,5 @@
-"""The command line: each command has a module, which parses options, calls the library
-and prints the result.
+"""The command line. Each command has a module that defines its options, calls the
+library and prints the result.
 
 Exit codes: 0 success, 1 failure, 2 wrong usage, 130 interrupt. Errors are one line on
 stderr; results go to stdout.

@@ -1,4 +1,4 @@
-"""Shared code of the commands: options, checks of paths, and printed results."""
+"""Code that the commands share: options, checks of paths, and printing of results."""
 
 import difflib
 import json
@@ -23,16 +23,16 @@ from v3dg.scene import Subject
 
 
 class UsageError(Exception):
-    """Wrong arguments; exit code 2."""
+    """Raised for wrong arguments; the exit code is 2."""
 
 
-# Exceptions that a command reports in one line on stderr; any other is a bug, whose
-# traceback is shown.
+# Exceptions that a command reports as one line on stderr. Any other exception is a bug,
+# so its traceback is shown.
 FAILURES = (OSError, MemoryError, ValueError, RuntimeError, ImportError)
 
 
 def failure_text(error: BaseException) -> str:
-    """One line that says what failed."""
+    """Return a one-line description of a failure."""
     if isinstance(error, OSError) and error.strerror:
         if error.filename:
             return f"{error.filename}: {error.strerror}"
@@ -46,8 +46,8 @@ def failure_text(error: BaseException) -> str:
 
 
 def printable(line: str) -> str:
-    """Return a line with its control characters escaped, because file names and texts
-    of files may contain any."""
+    """Return a line in which control characters are escaped, because file names and
+    content of files may contain them."""
     return "".join(map(_printable_letter, line))
 
 
@@ -58,12 +58,13 @@ def _printable_letter(letter: str) -> str:
 
 
 def tell(text: str) -> None:
-    """Print one line on stderr, with the secrets of URLs left out."""
+    """Print one line on stderr, without the secret parts of URLs."""
     print(printable(" ".join(cleaned(text).split())), file=sys.stderr)
 
 
 def option(metavar: str, *aliases: str) -> object:
-    """Annotation of an option that is None by default, which its help explains."""
+    """Return the annotation of an option whose default is None; its help text describes
+    the default."""
     return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
 
 
@@ -74,7 +75,7 @@ Threads: TypeAlias = Annotated[int | None, option("N")]
 
 @dataclass(kw_only=True)
 class Common:
-    """Options of every command."""
+    """Options that every command has."""
 
     threads: Threads = None
     """Number of CPU threads; all cores by default."""
@@ -94,13 +95,13 @@ class OnDevice(Common):
 @dataclass(kw_only=True)
 class OnPool(OnDevice):
     memory: Annotated[str, option("SIZE")] = "auto"
-    """Memory of the device for the pages of bundles, such as 2GB; pages are read from
-    the files as cameras need them. `all` loads everything; `auto` does so if it fits
-    into the free memory, and otherwise uses half of the free memory."""
+    """Memory of the device for pages of bundles, such as 2GB. Pages are read from the
+    files as cameras need them. `all` loads everything; `auto` loads everything if it
+    fits into the free memory, and otherwise uses half of the free memory."""
 
     def pool(self) -> str | None:
-        """Return the memory of the pool as an argument of `Renderer`; None draws
-        without a pool."""
+        """Return the size of the pool as an argument of `Renderer`; None means no
+        pool."""
         if self.memory == "all":
             return None
         return self.memory
@@ -108,18 +109,18 @@ class OnPool(OnDevice):
 
 @dataclass(kw_only=True)
 class Cut:
-    """The cut of a bundle or a scene that is drawn."""
+    """Options for the cut of a bundle or a scene."""
 
     tolerance: Annotated[float | None, option("PX2")] = None
-    """Screen area in px² that one gaussian of a coarser cluster may stand for; 3 by
-    default, 0 draws the full detail."""
+    """Largest screen area in px² that one gaussian of a coarser cluster may stand for.
+    The default is 3; 0 draws full detail."""
     budget: Annotated[int | None, option("N")] = None
-    """Largest number of gaussians in one picture; without a tolerance, the picture is
+    """Largest number of gaussians in one picture. Without --tolerance, the picture is
     as fine as the budget allows."""
 
 
 def check_usage(name: str, holds: object, expected: str) -> None:
-    """Raise UsageError, whose message is ``name: expected ...``, unless ``holds``."""
+    """Raise UsageError with the message ``name: expected ...`` unless ``holds``."""
     if not holds:
         raise UsageError(f"{name}: expected {expected}")
 
@@ -132,7 +133,7 @@ def color_of(value: Color | str) -> Color | None:
     """Return the colour of --background; None if the value is `none`.
 
     Raises:
-        UsageError: It is no colour.
+        UsageError: The value is not a colour.
     """
     if value == "none":
         return None
@@ -153,11 +154,13 @@ def color_of(value: Color | str) -> Color | None:
 def require_file(path: Path, *suffixes: str) -> None:
     if not is_url(path) and not path.exists():
         if path.is_symlink():
-            expected = f"a file, got a link to {os.readlink(path)}, which does not exist"
+            expected = (
+                f"a file, got a link to {os.readlink(path)}, which does not exist; repair the link"
+            )
         else:
             expected = f"a file, got a path that does not exist{_similar(path)}"
         refuse(path, expected)
-    problem = "another name"
+    problem = "another suffix"
     if path.is_dir():
         problem = "a folder"
     is_known = beside(path).name.lower().endswith(suffixes)
@@ -165,33 +168,34 @@ def require_file(path: Path, *suffixes: str) -> None:
 
 
 def _similar(path: Path) -> str:
-    """Advice for a file that does not exist: a file of a similar name, if there is
-    one."""
+    """Return advice for a file that does not exist: a similar name in its folder, if
+    there is one."""
     if path.parent.is_dir():
         names = [name for name in os.listdir(path.parent) if path.with_name(name).exists()]
         similar = difflib.get_close_matches(path.name, names, 1, 0.75)
         if similar:
             return f"; perhaps you meant {path.with_name(similar[0])}"
-    return "; check it"
+    return "; check the path"
 
 
 def open_subject(path: Path, *, show: bool) -> tuple[Subject, dict[str, Camera] | None]:
-    """Open a scene with its cameras, a bundle or an asset, and show that it takes
-    time."""
+    """Open a scene with its cameras, a bundle or an asset. With ``show``, display that
+    reading takes time."""
     with waiting(printable(f"reading {shown(path)}"), show=show):
         return open_with_cameras(path)
 
 
 def check_output(output: Path, *inputs: Path) -> None:
-    """Refuse a URL, and to overwrite an input, which may contain more than the
-    output."""
-    check_usage(shown(output), not is_url(output), "a local file to write, got a URL")
+    """Raise an error for an output that is a URL, or that would overwrite an input,
+    which may contain more than the output."""
+    check_usage(shown(output), not is_url(output), "a local file as output, got a URL")
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))
         check_usage(
             str(output),
             is_another,
-            f"another file than the input {shown(path)}; choose another name",
+            f"an output that is not the input {shown(path)}, got the same file; choose another "
+            "name",
         )
 
 
@@ -206,15 +210,15 @@ def level_size(bundle: Bundle, level: int) -> int:
 
 
 def finite(number: float) -> float | None:
-    """Return a number for JSON, which has no infinity; None stands for the infinite
-    tolerance of a small budget."""
+    """Return a number for JSON, which has no infinity; infinity becomes None. A
+    tolerance is infinite if the budget is very small."""
     if math.isfinite(number):
         return number
     return None
 
 
 def print_result(result: Mapping[str, object], lines: Iterable[str], *, as_json: bool) -> None:
-    """Print a result on stdout: its JSON values, or lines of text."""
+    """Print a result on stdout, as JSON or as lines of text."""
     if as_json:
         print(json.dumps(result, indent=1), flush=True)
     else:
@@ -223,8 +227,8 @@ def print_result(result: Mapping[str, object], lines: Iterable[str], *, as_json:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: its head, and the format of its cells, as `str.format_map`
-    takes it."""
+    """A column of a table: its heading, and the format of its cells for
+    `str.format_map`."""
 
     head: str
     form: str
@@ -233,12 +237,13 @@ class Column:
         """Return the cell of a row; `-` if the row lacks a value."""
         try:
             return printable(self.form.format_map(row))
-        except (KeyError, TypeError):  # the value is missing, or is None, which takes no format
+        # The value is missing, or it is None, which has no numeric format.
+        except (KeyError, TypeError):
             return "-"
 
 
 def table_lines(columns: Sequence[Column], rows: Iterable[Mapping[str, object]]) -> list[str]:
-    """Return the lines of a table; its first column is aligned to the left, the others
+    """Return the lines of a table. The first column is aligned to the left, all others
     to the right."""
     table = [[column.head for column in columns]]
     for row in rows:

@@ -1,5 +1,5 @@
-"""Options that edit the gaussians that a command writes: add files, crop, delete,
-drop, cut the degree."""
+"""Options for editing the gaussians that a command writes: add files, crop, delete,
+drop, and change the SH degree."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -23,28 +23,30 @@ _PLACEMENT = "X,Y,Z or X,Y,Z,SCALE or X,Y,Z,SCALE,RX,RY,RZ"
 
 @dataclass(kw_only=True)
 class EditOptions:
-    """Edits of the gaussians that are written, in this order: outliers are dropped from
-    each file, the files are placed, joined and moved as a whole, the result is cropped,
-    and the other limits apply to what is left. Coordinates of crops are those of the
-    result, as `v3dg info` shows them for a .ply of it."""
+    """Edits of the written gaussians, in this order: outliers are dropped from each
+    file; the files are placed, joined and moved as a whole; the result is cropped; and
+    the other limits are applied. Coordinates of crops are those of the result, as `v3dg
+    info` shows them for a .ply."""
 
     add: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, option("FILE@X,Y,Z")] = ()
-    """Add another asset or bundle, placed at X,Y,Z in the frame of the first; a fourth
-    number scales it, and three more turn it, in degrees about x, then y, then z. Can be
-    repeated."""
+    """Add another asset or bundle, placed at X,Y,Z in the frame of the first. A fourth
+    number scales it, and three more numbers rotate it, in degrees about x, then y, then
+    z. Can be repeated."""
     drop_outliers: Flag = False
-    """Drop gaussians further than 20 median distances from all others, as `v3dg info`
-    counts them."""
+    """Drop gaussians that are more than 20 median distances away from the median; `v3dg
+    info` counts them."""
     crop: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, option("SHAPE")] = ()
-    """Keep what is in box:X0,Y0,Z0,X1,Y1,Z1 (opposite corners; inf leaves a side open)
-    or sphere:X,Y,Z,RADIUS; repeated, what is in all of them."""
+    """Keep only gaussians in box:X0,Y0,Z0,X1,Y1,Z1 (opposite corners; inf means no
+    limit) or in sphere:X,Y,Z,RADIUS. If repeated, keep only gaussians that are in all
+    of them."""
     delete: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, option("SHAPE")] = ()
-    """Delete what is in a box or a sphere, written as for --crop. Can be repeated."""
+    """Delete gaussians in a box or a sphere, which are specified as for --crop. Can be
+    repeated."""
     min_opacity: Annotated[float | None, option("X")] = None
-    """Drop gaussians with an opacity below X, 0 to 1."""
+    """Drop gaussians with an opacity below X, from 0 to 1."""
     degree: Annotated[Literal[0, 1, 2, 3] | None, option("{0,1,2,3}")] = None
-    """Write spherical harmonics of this degree: higher ones are cut; missing ones are
-    zeros, for programs that read files of degree 3 only."""
+    """Write spherical harmonics of this degree. Higher degrees are removed; missing
+    ones are zero, for programs that only read files of degree 3."""
 
     def option_names(self) -> list[str]:
         """Return the names of the options on the command line."""
@@ -59,7 +61,7 @@ class EditOptions:
         return [name for name, value in options.items() if value]
 
     def check(self) -> None:
-        """Refuse wrong values before anything is read."""
+        """Raise an error for invalid values, before anything is read."""
         for text in self.add:
             require_file(_Addition.parse(text).path, *SUFFIXES, ".v3dg")
         for text in self.crop:
@@ -68,10 +70,12 @@ class EditOptions:
             _Shape.parse("--delete", text)
         if self.min_opacity is not None:
             is_opacity = 0 <= self.min_opacity <= 1
-            check_usage("--min-opacity", is_opacity, f"0 to 1, got {self.min_opacity}")
+            check_usage(
+                "--min-opacity", is_opacity, f"a number from 0 to 1, got {self.min_opacity}"
+            )
 
     def added_paths(self) -> list[Path]:
-        """The files of --add."""
+        """Return the files of --add."""
         return [_Addition.parse(text).path for text in self.add]
 
 
@@ -79,7 +83,8 @@ Edits: TypeAlias = Annotated[EditOptions, tyro.conf.OmitArgPrefixes]
 
 
 class Editor:
-    """Applies the options of a command and counts the gaussians that were left out."""
+    """Applies the editing options of a command, and counts the gaussians that they
+    remove."""
 
     def __init__(self, options: EditOptions) -> None:
         self._options = options
@@ -89,8 +94,8 @@ class Editor:
         self._degree_after = 0
 
     def joined(self, gaussians: Gaussians) -> Gaussians:
-        """Return the gaussians and those of the added files, all without the outliers
-        of their files."""
+        """Return the gaussians together with those of the added files. Outliers of each
+        file are dropped if the option is given."""
         parts = [self._without_outliers(gaussians)]
         for text in self._options.add:
             addition = _Addition.parse(text)
@@ -98,7 +103,7 @@ class Editor:
         return editing.join(parts)
 
     def trimmed(self, gaussians: Gaussians) -> Gaussians:
-        """Return the gaussians that the crops and limits leave, with SH of the chosen
+        """Return the gaussians that remain after crops and limits, with the chosen SH
         degree."""
         options = self._options
         remaining = gaussians
@@ -116,8 +121,8 @@ class Editor:
         if len(gaussians) and not len(remaining):
             names = ", ".join(options.option_names())
             raise ValueError(
-                f"{names}: nothing is left of {len(gaussians):,} gaussians ({self._counts()}); "
-                "v3dg info shows where they are"
+                f"{names}: nothing remains of {len(gaussians):,} gaussians ({self._counts()}); "
+                "v3dg info shows their positions"
             )
         self._degree_before = remaining.sh_degree
         self._degree_after = remaining.sh_degree
@@ -127,13 +132,14 @@ class Editor:
         return remaining
 
     def result(self) -> dict[str, object]:
-        """Return the counts, for a command's result as JSON; empty without options."""
+        """Return the counts for the JSON result of a command; empty without editing
+        options."""
         if not self._options.option_names():
             return {}
         return {"added": len(self._options.add), "left_out": dict(self._left_out)}
 
     def lines(self) -> list[str]:
-        """Return lines that say what was added, left out and cut."""
+        """Return lines that describe what was added and removed."""
         lines = []
         if self._options.add:
             lines.append(f"{1 + len(self._options.add)} files joined")
@@ -142,10 +148,10 @@ class Editor:
             numbers = f"{num_left_out:,} of {self._num_before:,} gaussians"
             lines.append(f"left out {numbers}: {self._counts()}")
         if self._degree_after < self._degree_before:
-            lines.append(f"SH of degree {self._degree_before} cut to {self._degree_after}")
+            lines.append(f"SH reduced from degree {self._degree_before} to {self._degree_after}")
         if self._degree_after > self._degree_before:
             lines.append(
-                f"SH of degree {self._degree_before} extended to {self._degree_after} by zeros"
+                f"SH extended from degree {self._degree_before} to {self._degree_after} with zeros"
             )
         return lines
 
@@ -175,7 +181,7 @@ class Editor:
 
 @dataclass(frozen=True)
 class _Addition:
-    """A file and its placement in the frame of the first."""
+    """A file and its placement in the frame of the first file."""
 
     path: Path
     position: tuple[float, float, float]
@@ -184,8 +190,8 @@ class _Addition:
 
     @staticmethod
     def parse(text: str) -> "_Addition":
-        """Parse a value of --add. If a file has the whole value as its name, it has no
-        placement."""
+        """Parse a value of --add. If the whole value is the name of an existing file,
+        there is no placement."""
         name, separator, numbers_text = text.rpartition("@")
         if not separator or os.path.exists(text) or "/" in numbers_text:
             return _Addition(Path(text), (0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
@@ -233,7 +239,7 @@ class _Shape:
             numbers = _numbers(name, numbers_text, _SHAPES, text, (6,))
             is_box = all(map(_is_ordered, numbers[:3], numbers[3:]))
             check_usage(
-                name, is_box, f"the smaller of each coordinate first in box:..., got {text}"
+                name, is_box, f"the smaller value of each coordinate first in box:..., got {text}"
             )
             return _Shape("box", numbers)
         check_usage(name, kind == "sphere", f"{_SHAPES}, got {text}")
@@ -259,8 +265,8 @@ def _is_ordered(low: float, high: float) -> bool:
 def _numbers(
     name: str, numbers_text: str, expected: str, text: str, counts: Iterable[int]
 ) -> tuple[float, ...]:
-    """Return numbers that are separated by commas; refuse NaN, and any number of them
-    that is not in `counts`."""
+    """Parse numbers separated by commas. Raise UsageError for NaN, and if their count
+    is not in `counts`."""
     try:
         numbers = tuple(map(float, numbers_text.split(",")))
     except ValueError:

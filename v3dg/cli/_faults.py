@@ -1,4 +1,4 @@
-"""Options for gaussians with wrong values: leave them out, or refuse them."""
+"""Options for gaussians with invalid values: leave them out, or raise an error."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,19 +18,21 @@ _NO_ROTATION = "with a rotation of length zero"
 
 @dataclass(kw_only=True)
 class FaultOptions:
-    """Gaussians with wrong values: not finite, with negative scales, opacities outside
-    of 0 to 1, or rotations of length zero."""
+    """Options for gaussians with invalid values: values that are not finite, negative
+    scales, opacities outside 0 to 1, or zero rotations."""
 
     drop_bad: Flag = False
-    """Leave out gaussians with wrong values, and say how many."""
+    """Leave out gaussians with invalid values, and print how many there are."""
     strict: Flag = False
-    """Refuse an input with wrong values; by default a .ply keeps what is not finite,
-    and other formats, which cannot hold it, refuse it."""
+    """Fail if the input has invalid values. By default, a .ply keeps values that are
+    not finite, and other formats, which cannot store them, fail."""
 
     def check(self) -> None:
-        """Refuse options that contradict each other."""
+        """Raise UsageError for options that contradict each other."""
         is_one = not (self.drop_bad and self.strict)
-        check_usage("--strict", is_one, "it or --drop-bad, got both; leave out one")
+        check_usage(
+            "--strict", is_one, "only one of --strict and --drop-bad, got both; leave out one"
+        )
 
 
 Faults: TypeAlias = Annotated[FaultOptions, tyro.conf.OmitArgPrefixes]
@@ -38,8 +40,8 @@ Faults: TypeAlias = Annotated[FaultOptions, tyro.conf.OmitArgPrefixes]
 
 @dataclass(frozen=True)
 class Checked:
-    """Gaussians to write, how many were left out because of wrong values, by kind, and
-    a line that says so, or that they were kept; empty without any."""
+    """The gaussians to write; the number of those left out for each kind of invalid
+    value; and a line about invalid values, which is empty if there are none."""
 
     gaussians: Gaussians
     dropped: dict[str, int]
@@ -47,8 +49,8 @@ class Checked:
 
 
 def checked(options: FaultOptions, gaussians: Gaussians, subject: Path, output: Path) -> Checked:
-    """Apply the options; ValueError names the file whose wrong values cannot be
-    written."""
+    """Apply the options. If the output cannot store the invalid values, raise a
+    ValueError that names the input."""
     findings = examine(gaussians)
     is_unrotated = has_no_rotation(gaussians)
     is_wrong = findings.wrong | is_unrotated
@@ -58,20 +60,20 @@ def checked(options: FaultOptions, gaussians: Gaussians, subject: Path, output: 
     counts = {kind: count for kind, count in findings.counts.items() if kind != "transparent"}
     if is_unrotated.any():
         counts["quats_zero"] = int(is_unrotated.sum())
-    text = f"{num_wrong:,} of {len(gaussians):,} gaussians have wrong values: {_text(counts)}"
+    text = f"{num_wrong:,} of {len(gaussians):,} gaussians have invalid values: {_text(counts)}"
     if options.drop_bad:
         return Checked(gaussians.subset(~is_wrong), counts, f"{shown(subject)}: left out: {text}")
     advice = "leave them out with --drop-bad"
     if options.strict:
         raise ValueError(f"{shown(subject)}: {text}; {advice} instead of --strict")
     if not _holds(output, gaussians):
-        raise ValueError(f"{shown(subject)}: {text}, which {output.name} cannot hold; {advice}")
+        raise ValueError(f"{shown(subject)}: {text}, which {output.name} cannot store; {advice}")
     return Checked(gaussians, {}, f"{shown(subject)}: {text}, which {output.name} keeps; {advice}")
 
 
 def _holds(output: Path, gaussians: Gaussians) -> bool:
-    """Return whether a file of this name can hold the gaussians' wrong values: a `.ply`
-    stores logs and logits, so it holds values that have them."""
+    """Return whether a file with this name can store the invalid values of gaussians.
+    Only a `.ply` can, if the values have a logarithm or a logit."""
     name = output.name.lower()
     if not name.endswith(".ply") or name.endswith(".compressed.ply"):
         return False
@@ -81,7 +83,7 @@ def _holds(output: Path, gaussians: Gaussians) -> bool:
 
 
 def _text(counts: Mapping[str, int]) -> str:
-    """Counts of kinds in words."""
+    """Return counts of invalid values as text."""
     texts = []
     for kind, count in counts.items():
         if kind == "quats_zero":

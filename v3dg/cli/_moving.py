@@ -1,4 +1,4 @@
-"""Options that move the gaussians that a command writes: scale, turn, translate."""
+"""Options for moving the gaussians that a command writes: scale, rotate, translate."""
 
 import math
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ _TURNS = "AXIS:DEGREES such as z:90, or quaternion:W,X,Y,Z"
 
 @dataclass(kw_only=True)
 class MoveOptions:
-    """Where gaussians go: they are scaled about the origin, then turned about it, then
-    translated. Axes are those that `v3dg info` shows."""
+    """Options for moving gaussians: they are scaled about the origin, then rotated
+    about the origin, then translated. `v3dg info` shows the axes."""
 
     scale: Annotated[float | None, option("S")] = None
-    """Multiply positions and sizes by this."""
+    """Multiply positions and sizes by this factor."""
     rotate: Annotated[str | None, option("AXIS:DEGREES")] = None
-    """Turn by degrees about an axis, such as z:90, or by quaternion:W,X,Y,Z; colours
-    turn, too."""
+    """Rotate by degrees about an axis, such as z:90, or by quaternion:W,X,Y,Z. Colours
+    are rotated, too."""
     translate: Annotated[tuple[float, float, float] | None, option("X Y Z")] = None
-    """Move by this much, after --scale and --rotate."""
+    """Translate by this vector, after --scale and --rotate."""
 
     def option_names(self) -> list[str]:
         """Return the names of the options on the command line."""
@@ -37,7 +37,7 @@ class MoveOptions:
         return [name for name, value in values.items() if value is not None]
 
     def check(self) -> None:
-        """Refuse wrong values before anything is read."""
+        """Raise an error for invalid values, before anything is read."""
         if self.scale is not None:
             is_size = math.isfinite(self.scale) and self.scale > 0
             check_usage("--scale", is_size, f"a number above 0, got {self.scale}")
@@ -48,7 +48,7 @@ class MoveOptions:
             check_usage("--translate", is_finite, f"finite numbers, got {self.translate}")
 
     def moved(self, gaussians: Gaussians) -> Gaussians:
-        """Return the gaussians after scaling, rotation and translation; without
+        """Return the gaussians after scaling, rotation and translation. Without these
         options, return the same object."""
         if not self.option_names():
             return gaussians
@@ -66,7 +66,7 @@ Moves: TypeAlias = Annotated[MoveOptions, tyro.conf.OmitArgPrefixes]
 
 
 def _quaternion(text: str) -> Floats:
-    """Return the quaternion (4,) w x y z of a value of --rotate."""
+    """Return the quaternion (4,) w x y z for a value of --rotate."""
     kind, _, numbers_text = text.partition(":")
     try:
         numbers = [float(number) for number in numbers_text.split(",")]

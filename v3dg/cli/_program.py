@@ -1,5 +1,5 @@
-"""A program of several commands: parses, runs one, and turns failures into one line and
-an exit code."""
+"""A program with several commands: parses the command line, runs one command, and
+reports a failure as one line and an exit code."""
 
 import ast
 import contextlib
@@ -28,38 +28,38 @@ from v3dg import _start
 from v3dg._version import __version__
 from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, tell
 
-# Each command has a class of options of its own, with the function that runs on them.
+# Each command has its own class of options, and a function that takes an instance of
+# that class.
 Options: TypeAlias = Any
-# Commands by name, in the order of the help.
+# Commands by name, in the order in which the help lists them.
 Commands: TypeAlias = Mapping[str, tuple[type[Options], Callable[[Options], None]]]
 
 INTERRUPTED = 130  # exit code
 _HELP = ("-h", "--help", "--tyro-write-completion", "--tyro-print-completion")
 
-# More than any machine has cores. If the system refuses a thread, OpenMP ends the
-# process.
+# More than the number of cores of any machine. A limit is needed because OpenMP ends
+# the process if the system cannot create a thread.
 _MOST_THREADS = 1024
 _LEAST_COLUMNS = 40
 
 
 @dataclass(frozen=True)
 class Program:
-    """The name that starts the program, the description in its help, and its
-    commands."""
+    """The name of a program, the description in its help, and its commands."""
 
     name: str
     description: str
     commands: Commands
 
     def parse(self, arguments: Sequence[str]) -> Options:
-        """Parse the command line; the boxed message of tyro becomes one line."""
+        """Parse the command line; a multi-line error of tyro becomes one line."""
         if any(argument in _HELP for argument in arguments):
             self.join_help()
         subcommands: list[Options] = [
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in self.commands.items()
         ]
-        if "" in arguments:  # an empty path would name the working folder
+        if "" in arguments:  # an empty path would mean the working directory
             number = list(arguments).index("") + 1
             raise UsageError(f"argument {number} is empty; is a shell variable unset?")
         caught = io.StringIO()
@@ -78,15 +78,15 @@ class Program:
             raise UsageError(self._one_line(caught.getvalue(), arguments)) from None
 
     def join_help(self) -> None:
-        """Make one line of the docstring of each option: tyro keeps line breaks before
-        indented lines."""
+        """Join the docstring of each option to one line, because tyro keeps line breaks
+        before indented lines."""
         for options, _ in self.commands.values():
             for kind in options.__mro__[:-1]:
                 _join_help(kind)
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
-        """Return the message for a wrong command line: an unknown name, or else the
-        text of tyro's first box."""
+        """Return the message for a wrong command line: about an unknown command or
+        option, or else the text of tyro's first box."""
         if not arguments:
             return f"{_text_of_first_box(boxed)}; run {self.name} --help"
         command = arguments[0]
@@ -99,7 +99,7 @@ class Program:
 
     def _unknown_option(self, command: str, arguments: Sequence[str]) -> str | None:
         """Return the message for the first option that the command does not have; None
-        if it has all of them."""
+        if there is none."""
         options = self._options(command)
         for argument in arguments:
             name = argument.partition("=")[0].replace("_", "-")
@@ -109,29 +109,31 @@ class Program:
         return None
 
     def _options(self, command: str) -> list[str]:
-        """Return the names of the options in the help of a command."""
+        """Return the names of the options of a command, from its help."""
         with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
             self.parse([command, "--help"])
         return re.findall(r"--[a-z][a-z-]*", printed.getvalue())
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
-        """Run one command, by default the one this program was started with, and return
-        its exit code."""
+        """Run one command and return its exit code. By default, it is the command with
+        which this process was started."""
         if arguments is None:
             warnings.showwarning = lambda message, *_, **__: tell(f"v3dg: warning: {message}")
         code = 0
         try:
             code = self._run(arguments)
             code = _flush(code)
-        except KeyboardInterrupt:  # after the end of the command, or after an interrupt of it
+        # After the command has ended, or while an interrupt was handled.
+        except KeyboardInterrupt:
             if arguments is not None:
                 raise
             code = code or _fail("interrupted", INTERRUPTED)
         if arguments is None:
-            for number in _start.SIGNALS:  # nothing is left to interrupt
+            # At the end of the process, signals are ignored.
+            for number in _start.SIGNALS:
                 signal.signal(number, signal.SIG_IGN)
             if code == INTERRUPTED:
-                os._exit(code)  # does not wait for threads that still run
+                os._exit(code)  # does not wait for other threads
         return code
 
     def _run(self, arguments: Sequence[str] | None) -> int:
@@ -147,7 +149,7 @@ class Program:
                 _set_threads(getattr(options, "threads", None))
                 _start.raise_interrupts()
             next(run for kind, run in self.commands.values() if isinstance(options, kind))(options)
-        except SystemExit:  # after the help
+        except SystemExit:  # raised after the help was printed
             return 0
         except UsageError as error:
             return _fail(str(error), 2)
@@ -162,8 +164,8 @@ class Program:
 
 @functools.cache
 def _join_help(kind: type[Options]) -> None:
-    """Put the docstrings of options into the annotations of their class, each as one
-    line."""
+    """Copy the docstring of each option in a class to the annotation of the option, as
+    one line."""
     annotations = inspect.get_annotations(kind)
     (source,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     for field, docstring in itertools.pairwise(cast(ast.ClassDef, source).body):
@@ -184,8 +186,8 @@ def _join_help(kind: type[Options]) -> None:
 
 @contextlib.contextmanager
 def _legible_width() -> Iterator[None]:
-    """Pretend that a very narrow terminal has room for a few words, because tyro does
-    not terminate in 5 columns."""
+    """Use at least a minimum width of the terminal, because tyro does not terminate
+    with 5 columns."""
     if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
         yield
         return
@@ -200,8 +202,8 @@ def _legible_width() -> Iterator[None]:
 
 
 def _suggestion(name: str, choices: Sequence[str]) -> str:
-    """Return the end of a message that suggests the choice most like an unknown name;
-    empty if none is like it."""
+    """Return the end of a message that suggests the choice most similar to an unknown
+    name; empty if no choice is similar."""
     similar = difflib.get_close_matches(name, choices, 1, 0.7)
     if similar:
         return f"; perhaps you meant {similar[0]}"
@@ -209,14 +211,14 @@ def _suggestion(name: str, choices: Sequence[str]) -> str:
 
 
 def _text_of_first_box(boxed: str) -> str:
-    """Return the text of the first box that tyro draws, in our words."""
+    """Return the text of the first box that tyro prints, in plain words."""
     lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
     end = next((i for i, line in enumerate(lines) if not line), len(lines))
     return _plainly(" ".join(lines[:end]).rstrip("."))
 
 
 def _plainly(text: str) -> str:
-    """Return a message of tyro without Python types and None, with the choices in a
+    """Return a message of tyro without Python's types and None, and with choices in a
     fixed order."""
     if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
         expected = "whole numbers"
@@ -237,26 +239,26 @@ def _plainly(text: str) -> str:
 
 
 def _set_threads(threads: int | None) -> None:
-    """Restart this process with that many threads: OpenMP reads the number once, when
-    it is loaded."""
+    """Restart this process with a number of threads, because OpenMP reads that number
+    only once, when it is loaded."""
     if threads is None:
         return
     check_range("--threads", threads, 1, _MOST_THREADS)
     if os.environ.get("OMP_NUM_THREADS") != str(threads):
         os.environ["OMP_NUM_THREADS"] = str(threads)
-        # Ctrl-C is blocked until the next process can handle it.
+        # Ctrl-C stays blocked until the new process can handle it.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def _flush(code: int) -> int:
-    """Flush stdout, and return the exit code, which is 1 if that fails."""
+    """Flush stdout and return the exit code, which becomes 1 if flushing fails."""
     try:
         sys.stdout.flush()
     except OSError as error:
-        # Python flushes again when it exits, which must not fail.
+        # Python flushes stdout again at exit, and that must not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        # A closed pipe is not reported, because its reader needs no more.
+        # A closed pipe is not reported, because its reader does not want more output.
         if code == 0 and not isinstance(error, BrokenPipeError):
             return _fail(f"stdout: {error.strerror}", 1)
         return code or 1

@@ -1,5 +1,5 @@
-"""The cameras of commands: one that the options place, those of a file, a scene's own,
-or first views of the subject."""
+"""The cameras of commands: a camera placed by options, cameras from a file, those of a
+scene, or first views of the subject."""
 
 import math
 import os
@@ -32,76 +32,77 @@ from v3dg.upright import ASSUMED, direction_of, up_of
 
 _DEFAULT_FOV = 45.0  # degrees
 
-# All cameras are made before the first picture is drawn.
+# Limited because all cameras are created before the first picture is drawn.
 _MOST_VIEWS = 10_000
 
 
 @dataclass(kw_only=True)
 class CameraFile:
-    """Cameras from a file of another program."""
+    """Options for cameras from a file of another program."""
 
     cameras: Annotated[Path | None, option("PATH")] = None
     """Use the cameras of this nerfstudio transforms.json, nerfstudio run or COLMAP
-    model; `view` offers them with their photographs."""
+    model. `view` offers them together with their photographs."""
     distortion: Literal["draw", "ignore"] = "draw"
-    """Whether pictures have the lens distortion of that file, or it is left out."""
+    """Whether pictures have the lens distortion of that file, or it is ignored."""
 
     def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
-        """Return the cameras of --cameras, with this size if their file has none;
-        return none without the option."""
+        """Return the cameras of --cameras; empty without that option. `size` is used if
+        the file has no size."""
         if self.cameras is None:
             return {}
         cameras = read_cameras(self.cameras, size=size, distortion=self.distortion)
-        check(self.cameras, cameras, "cameras, got a file without any")
+        check(self.cameras, cameras, "cameras, got a file with none")
         return cameras
 
 
 @dataclass
 class ViewOptions(CameraFile):
-    """The cameras of the pictures: one that is placed here, those of a camera file or
-    of a scene, or first views of the subject."""
+    """Options for the cameras of pictures: a camera placed by options, cameras from a
+    file or a scene, or first views of the subject."""
 
     eye: Annotated[tuple[float, float, float] | None, option("X Y Z")] = None
-    """Look from this point of the world."""
+    """Look from this point in world space."""
     target: Annotated[tuple[float, float, float] | None, option("X Y Z")] = None
-    """Look from --eye at this point; by default at the middle of the subject."""
+    """Look from --eye to this point; by default to the middle of the subject."""
     fov: Annotated[float | None, option("DEGREES")] = None
-    """Field of view from --eye, across the width of the picture; 45 by default."""
+    """Field of view of --eye across the width of the picture in degrees; 45 by
+    default."""
     link: Annotated[str | None, tyro.conf.arg(name="at", metavar="LINK", help_behavior_hint="")] = (
         None
     )
-    """Look from the camera of a link: an address of the page of `v3dg view`, in
-    quotes."""
+    """Use the camera of a link: the address of a page of `v3dg view`, in quotes."""
     camera: Annotated[str | None, option("NAME")] = None
-    """Draw only this camera of a file with cameras, given by its name or its number in
-    the file, from 0."""
+    """Draw only this one of several cameras, by its name or its number, from 0."""
     views: Annotated[int | None, option("N")] = None
-    """Number of views around the subject, or around its viewer where it is a room; 1 by
+    """Number of views around an object, or around the viewer inside a room; 1 by
     default, 8 for `compare`."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
-    """Width and height in px of pictures whose camera's file has no size."""
+    """Width and height in px of pictures for which the file of the camera has no
+    size."""
     elevation: Annotated[float | None, option("DEGREES")] = None
-    """Height of the cameras around the subject above the horizon; 20 by default."""
+    """Elevation of the cameras around the subject above the horizon in degrees; 20 by
+    default."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that is up around the subject and for --eye; by default the one in the
-    file, or a guess."""
+    """The axis that points up for --eye and for views around the subject; by default
+    the one in the file, or a guess."""
 
     def check(self, *subjects: Path) -> None:
-        """Refuse wrong subjects, and options that do not apply to them, before anything
-        is read."""
+        """Raise an error for invalid subjects, and for options that do not apply to
+        them, before anything is read."""
         for path in subjects:
             require_subject(path)
         for side in self.size:
             check_range("--size", side, 1, MOST_SIDE)
         for name, value in (("--target", self.target), ("--fov", self.fov)):
-            check_usage(name, value is None or self.eye, "--eye beside it; give one")
+            check_usage(name, value is None or self.eye, "--eye together with it, got no --eye")
         check_range("--fov", self.fov or _DEFAULT_FOV, 0.001, 179)
         sources = {"--eye": self.eye, "--at": self.link, "--cameras": self.cameras}
         names = [name for name, value in sources.items() if value is not None]
-        check_usage(", ".join(names), len(names) < 2, "one of them; leave out the others")
+        check_usage(", ".join(names), len(names) < 2, "only one of these options, got several")
         is_placed = self.eye is not None or self.link is not None
         has_file = self.cameras is not None or any(map(is_scene, subjects))
-        expected = "--cameras or a scene (.json) to take it from; leave it out"
+        expected = "--cameras or a scene (.json) that has cameras, got none; leave it out"
         fits = self.camera is None or (has_file and not is_placed)
         check_usage("--camera", fits, expected)
         if self.cameras is not None:
@@ -113,25 +114,26 @@ class ViewOptions(CameraFile):
         check_range("--elevation", self.elevation or 0, -89.99, 89.99)
 
     def check_turntable(self, source: str) -> None:
-        """Refuse options of the views around a subject where other cameras draw it."""
+        """Raise UsageError if options for views around the subject are combined with
+        other cameras."""
         for name, value in self.turntable().items():
             is_used = name == "--up" and self.eye is not None
             expected = f"a subject without cameras, got {source}; leave it out"
             check_usage(name, value is None or is_used, expected)
 
     def turntable(self) -> dict[str, object]:
-        """Return the options of views around a subject by name; None stands for an
-        option that was not given."""
+        """Return the options for views around the subject, by name; None for options
+        that were not given."""
         return {"--views": self.views, "--elevation": self.elevation, "--up": self.up}
 
     def needs_up(self, own_cameras: Mapping[str, Camera] | None) -> bool:
-        """Return whether the axis that is up has to be known."""
+        """Return whether the up axis must be known for the cameras."""
         has_cameras = self.link is not None or self.cameras is not None or bool(own_cameras)
         return self.eye is not None or not has_cameras
 
 
-# A field of a command's options; on the command line its options stand beside the
-# others.
+# The type of a field in the options of a command. On the command line, its options have
+# no prefix.
 Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
 
 
@@ -142,8 +144,8 @@ def choose_cameras(
     own_cameras: dict[str, Camera] | None,
     views: int = 1,
 ) -> dict[str, Camera]:
-    """Return the camera of --eye or --at, else those of --cameras, else the subject's
-    own, else first views of the subject (`views` of them by default)."""
+    """Return the camera of --eye or --at; else the cameras of --cameras; else those of
+    the subject; else first views of the subject (`views` of them by default)."""
     if options.link is not None:
         cameras = {"link": _linked(options.link, options.size)}
     elif options.eye is not None:
@@ -154,7 +156,7 @@ def choose_cameras(
             options.check_turntable(f"the cameras of {shown(path)}")
             cameras = own_cameras
     if not cameras:
-        refuse_without = "a scene with cameras to take it from; leave it out"
+        refuse_without = "a scene with cameras, got a subject without; leave it out"
         check_usage("--camera", options.camera is None, refuse_without)
         cameras = _around(subject, options, options.views or views)
     if options.camera is not None:
@@ -166,7 +168,7 @@ def choose_cameras(
 
 
 def _linked(link: str, size: tuple[int, int]) -> Camera:
-    """Return the camera of a link of the viewer's page."""
+    """Return the camera of a link to the viewer's page."""
     from v3dg.viewer.link import read_link
 
     place = read_link(link)
@@ -178,7 +180,7 @@ def _linked(link: str, size: tuple[int, int]) -> Camera:
 
 
 def _placed(options: ViewOptions, subject: Subject) -> Camera:
-    """The camera of --eye."""
+    """Return the camera of --eye."""
     assert options.eye is not None
     up = direction_of(options.up or up_of(subject)[0])
     target = options.target
@@ -196,7 +198,7 @@ def _placed(options: ViewOptions, subject: Subject) -> Camera:
 
 
 def _camera_name(text: str, names: Sequence[str]) -> str:
-    """Return the name of the camera that --camera selects by name or number."""
+    """Return the name of the camera that --camera selects by its name or number."""
     if text in names:
         return text
     if text.isdecimal() and int(text) < len(names):
@@ -204,13 +206,15 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
     choices = ", ".join(names[:8])
     if len(names) > 8:
         choices += " ..."
-    raise ValueError(f"--camera: expected one of {choices}, or 0 to {len(names) - 1}, got {text}")
+    raise ValueError(
+        f"--camera: expected one of {choices}, or a number from 0 to {len(names) - 1}, got {text}"
+    )
 
 
 def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Camera]:
-    """Return first views of a subject, from around an object or inside a room.
+    """Return the first views of a subject, around an object or inside a room.
 
-    A single one that no --views asks for is closer than views of a turntable.
+    Without --views, a single view is closer to the subject than views of a turntable.
     """
     elevation = DEFAULT_ELEVATION
     if options.elevation is not None:
@@ -227,8 +231,8 @@ def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Cam
 def choose_up(
     requested: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
-    """Return the axis that is up, from --up or else from `up_of`, and lines that say
-    why.
+    """Return the up axis, from --up or else from `up_of`, and lines that state the
+    reason.
 
     If the axis is unknown, a user at a terminal is asked.
     """
@@ -242,25 +246,27 @@ def choose_up(
 
 
 def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
-    """Return a line that says which axis is up and why; no line without a reason, as
-    for --up."""
+    """Return a line with the up axis and the reason for it; no line if the reason is
+    empty, as with --up."""
     if not reason:
         return []
     return [f"{beside(path).name}: {axis} is up, {reason}; change it with --up"]
 
 
 def is_at_terminal() -> bool:
-    """Return whether a user can answer questions. A job in the background cannot ask:
-    reading would stop it."""
+    """Return whether a user at a terminal can answer questions. A background job cannot
+    ask, because reading from the terminal would stop it."""
     is_open = sys.stdin and sys.stdin.isatty() and sys.stderr.isatty()
     return bool(is_open and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp())
 
 
 def ask_up(path: Path, axis: Axis) -> Axis:
-    """Ask the user at the terminal which axis is up; Enter, or the end of the input,
+    """Ask the user at the terminal for the up axis. Enter, or the end of the input,
     accepts `axis`."""
     while True:
-        question = printable(f"{beside(path).name}: which way is up, {', '.join(AXES)}? [{axis}] ")
+        question = printable(
+            f"{beside(path).name}: which axis points up, {', '.join(AXES)}? [{axis}]"
+        )
         print(question, end="", file=sys.stderr, flush=True)
         answer = sys.stdin.readline().strip() or axis
         for choice in AXES:
@@ -269,11 +275,10 @@ def ask_up(path: Path, axis: Axis) -> Axis:
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
-    """Return the paths of the pictures of cameras; if there are several, each path
-    contains the name of its camera.
+    """Return the path of the picture for each camera. If there are several cameras,
+    each path contains the camera's name.
 
-    If two paths would be the same, all have the number of their camera in the file
-    instead, from 0.
+    If two paths would be equal, all contain the cameras' numbers instead, from 0.
     """
     if len(cameras) == 1:
         return [output]
@@ -284,7 +289,7 @@ def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
 
 
 def _file_stem(name: str) -> str:
-    """Return the name of a camera as a part of a file's name, without the suffix of its
+    """Return the name of a camera as part of a file name, without the suffix of its
     photograph."""
     photograph = Path(name)
     if photograph.suffix.lower() in SUFFIXES and photograph.stem:

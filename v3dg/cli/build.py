@@ -30,10 +30,10 @@ from v3dg.levels.quality import Quality
 from v3dg.levels.scheduler import SchedulerError
 from v3dg.upright import ASSUMED, up_of
 
-_PATIENCE_S = 20  # time for a scheduler to answer
-_MOST_REASON = 200  # characters of an error of dask's
-# The number and the size, in gaussians, of the samples from which the axis that is up
-# is guessed.
+_PATIENCE_S = 20  # time limit for answers of a scheduler
+_MOST_REASON = 200  # maximum number of characters of a dask error that are shown
+# The number of samples, and the number of gaussians in each, from which the up axis is
+# guessed.
 _NUM_SAMPLES = 64
 _SAMPLE_SIZE = 256
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
@@ -41,55 +41,56 @@ _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 @dataclass
 class Build(_common.OnDevice):
-    """Build a bundle from a trained asset, or from each of many; one that fails does
-    not stop the others."""
+    """Build a bundle from a trained asset, or from each of several assets. If one of
+    several fails, the others are still built."""
 
     assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
-    """Files of trained gaussians, or folders of such files. With an --output that ends
-    in .v3dg, all files together are one asset."""
+    """Files of trained gaussians, or folders with such files. If --output ends in
+    .v3dg, all files together form one asset."""
     output: Annotated[Path | None, _common.option("PATH", "-o")] = None
-    """Bundle to write, or folder for the bundles of many assets; by default each bundle
-    is written beside its asset."""
+    """Bundle to write, or folder for the bundles of several assets. By default, each
+    bundle is written beside its asset."""
     config: Literal["default", "paper"] = "default"
-    """Settings of the build, the default ones or those of the V3DG paper."""
+    """Settings of the build: the defaults, or those of the V3DG paper."""
     cluster_size: Annotated[int | None, _common.option("N")] = None
-    """Maximum number of gaussians in a cluster; by default that of the config."""
+    """Maximum number of gaussians in a cluster; by default that of --config."""
     codec: Literal["float32", "quantized"] = "float32"
-    """Encoding of gaussians, with every bit, or rounded to 16 to 40 bytes
-    (docs/format.md has the error)."""
+    """Encoding of gaussians: lossless, or rounded to 16 to 40 bytes (docs/format.md
+    lists the errors)."""
     quality: Quality = "draft"
-    """How close levels come to the asset: `draft` as they are built; `standard` also
-    refined together, which takes seconds on a GPU and minutes on a CPU; `best` with
-    five times as many pictures. For a place that is seen from inside, use
-    `v3dg refine --cameras` instead."""
+    """How similar the levels are to the asset. `draft` keeps the levels as they are
+    built. `standard` also refines them together, which takes seconds on a GPU and
+    minutes on a CPU. `best` uses five times as many pictures for that. For a place that
+    is seen from inside, such as a room, use `v3dg refine --cameras` instead."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that is up in the asset, which the bundle records; if it is unknown, a
-    user at a terminal is asked."""
+    """The axis of the asset that points up, which the bundle stores. If it is unknown,
+    a user at a terminal is asked."""
     antialiased: Annotated[Literal["yes", "no"] | None, _common.option("{yes,no}")] = None
-    """Whether the asset was trained with antialiasing; by default what its file says,
-    or else no."""
+    """Whether the asset was trained with antialiasing; by default as declared in its
+    file, or no if it declares nothing."""
     seed: int = 0
-    """Seed of random numbers; the same seed gives the same file, byte for byte, on the
-    same kind of device, with any number of threads."""
+    """Seed of random numbers. The same seed gives the same file, byte for byte, on the
+    same kind of device and for any number of threads."""
     strict: _common.Flag = False
-    """Refuse an asset with wrong values; by default the gaussians that have them are
-    left out."""
+    """Fail if the asset has invalid values. By default, gaussians with invalid values
+    are left out."""
     resume: _common.Flag = False
-    """Continue after the last finished level, and keep finished bundles of these
-    gaussians and settings."""
+    """Continue after the last finished level, and keep finished bundles that were built
+    from the same gaussians with the same settings."""
     overwrite: _common.Flag = False
-    """Replace the bundles of many assets that exist already. The bundle of one asset is
+    """Replace existing bundles of several assets. The bundle of a single asset is
     always replaced."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
-    """Memory of the host for the build, such as 8GiB; by default half of the free
-    memory. An asset that does not fit is sorted on the disk of the output."""
+    """Host memory for the build, such as 8GiB; by default half of the free memory. An
+    asset that does not fit is sorted on the disk of the output."""
     scheduler: Annotated[str | None, _common.option("ADDRESS")] = None
-    """Build on the workers of a dask scheduler such as tcp://host:8786, which must have
-    access to the output's folder; needs the extra `cluster`."""
+    """Build on the workers of the dask scheduler at this address, such as
+    tcp://host:8786. The workers need access to the folder of the output. Needs the
+    extra `cluster`."""
 
 
 def run(options: Build) -> None:
-    expected = "one or more assets, or a folder of them, got nothing; run v3dg build --help"
+    expected = "at least one asset or a folder of assets, got nothing; run v3dg build --help"
     _common.check_usage("PATH", options.assets, expected)
     is_one = options.output is not None and options.output.suffix == ".v3dg"
     assets = _assets_of(options.assets)
@@ -106,8 +107,8 @@ def run(options: Build) -> None:
 
 
 def _asked_up(path: Path) -> Axis | None:
-    """Return the axis that is up; ask a user at a terminal if neither the format nor
-    the gaussians determine it."""
+    """Return the up axis of an asset that a user at a terminal enters; None if there is
+    no terminal, or if the format or the gaussians determine the axis."""
     if not is_at_terminal():
         return None
     _common.require_file(path, *SUFFIXES)
@@ -126,12 +127,14 @@ def _asked_up(path: Path) -> Axis | None:
 
 @contextmanager
 def _executor_at(address: str | None) -> Iterator[Executor | None]:
-    """The workers of a dask scheduler."""
+    """Return an executor with the workers of a dask scheduler; None without an
+    address."""
     if address is None:
         yield None
         return
     distributed = _extras.load("distributed")
-    for name in ("distributed", "distributed.client"):  # the command reports errors, once
+    # The command itself reports errors, once.
+    for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     _greet(address)
     expected = f"{address}: expected a dask scheduler"
@@ -139,20 +142,24 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         client = distributed.Client(address, timeout=_PATIENCE_S)
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split()) or "no answer"
-        raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
+        raise RuntimeError(
+            f"{expected} that answers, got none ({reason}); check the address"
+        ) from None
     except Exception as error:
-        # A server of another kind or version may cause an error of any type.
+        # Servers of another kind or version may cause an error of any type.
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:_MOST_REASON]
-        raise RuntimeError(f"{expected}, got something else ({reason})") from None
+        raise RuntimeError(
+            f"{expected}, got another server ({reason}); check the address"
+        ) from None
     with client:
         yield client.get_executor()
 
 
 def _greet(address: str) -> None:
-    """Send a greeting to a scheduler; RuntimeError unless a program of dask answers in
-    time.
+    """Send a greeting to a scheduler; raise RuntimeError unless it answers in time in
+    the protocol of dask.
 
-    A client would wait without end for a server that accepts connections and never
+    A dask client would wait forever for a server that accepts connections but never
     answers.
     """
     import asyncio
@@ -168,21 +175,24 @@ def _greet(address: str) -> None:
     try:
         comm.get_address_host_port(address)
     except ValueError as error:
-        text = f"{expected} such as tcp://host:8786, got no address ({error})"
+        text = f"{expected} such as tcp://host:8786, got an invalid address ({error})"
         raise RuntimeError(text) from None
     try:
         asyncio.run(connect())
     except (OSError, asyncio.TimeoutError) as error:
         reason = " ".join(str(error).split()) or "no answer"
-        raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
-    except TypeError as error:  # the scheduler uses TLS, and there are no certificates
+        raise RuntimeError(
+            f"{expected} that answers, got none ({reason}); check the address"
+        ) from None
+    # The scheduler uses TLS, but no certificates are configured.
+    except TypeError as error:
         raise RuntimeError(
             f"{expected} without TLS, got one that needs it ({error}); configure dask's security"
         ) from None
     except Exception:
-        # The error that dask raises for another protocol, whose first eight bytes it
-        # takes for a size.
-        advice = "give the address that `dask scheduler` prints"
+        # dask raises this error for another protocol, because it reads the first eight
+        # bytes as a size.
+        advice = "pass the address that `dask scheduler` prints"
         raise RuntimeError(
             f"{expected}, got a server that speaks another protocol; {advice}"
         ) from None
@@ -199,7 +209,7 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
             _common.tell(f"[{len(results) + 1}/{len(outputs)}] {shown(asset)}")
         try:
             results.append(_build(options, assets[asset], output, executor))
-        except SchedulerError as error:  # every other asset would wait for it, too
+        except SchedulerError as error:  # all further assets would fail in the same way
             raise SchedulerError(f"{error}; {_progress_text(results, outputs)}") from None
         except _common.FAILURES as error:
             failure = cleaned(_common.failure_text(error))
@@ -250,7 +260,7 @@ def _print_many(options: Build, results: list[JsonObject], seconds: float) -> No
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
-    """Return the files of each asset by the path that names it, which is a file or the
+    """Return the files of each asset, by the path that identifies it: a file, or the
     folder of a trainer's run."""
     assets: dict[Path, list[Path]] = {}
     for path in paths:
@@ -262,15 +272,15 @@ def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
             files = sorted(
                 p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file()
             )
-            expected = f"a folder with assets ({', '.join(SUFFIXES)}), or a run of a trainer"
-            check(path, files, f"{expected}, got one without")
+            expected = f"a folder with assets ({', '.join(SUFFIXES)}), or with a run of a trainer"
+            check(path, files, f"{expected}, got one with neither")
             for file in files:
                 assets[file] = [file]
     return assets
 
 
 def _output_of(asset: Path, folder: Path | None) -> Path:
-    """Return the path of the bundle that is named after an asset."""
+    """Return the path of the bundle for an asset, named after the asset."""
     if asset.is_dir():
         place = asset.resolve()
         stem = place.name
@@ -281,7 +291,7 @@ def _output_of(asset: Path, folder: Path | None) -> Path:
 
 
 def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
-    """Return the path of the bundle of each asset."""
+    """Return the path of the bundle for each asset."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     asset_from_output: dict[Path, Path] = {}
@@ -291,31 +301,32 @@ def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
         check(
             output,
             first == asset,
-            f"one asset for it, got {shown(first)} and {shown(asset)}; rename one",
+            f"one asset for this bundle, got {shown(first)} and {shown(asset)}; rename one of them",
         )
     return {asset: output for output, asset in asset_from_output.items()}
 
 
 def _check_new(outputs: Sequence[Path]) -> None:
-    """Refuse to replace bundles that nobody named."""
+    """Raise UsageError if bundles whose names the user has not given would be
+    replaced."""
     existing = [output for output in outputs if output.exists()]
     if existing:
         ending = ""
         if len(existing) > 1:
             ending = f", and {len(existing) - 1} more"
         advice = "--resume keeps finished bundles, --overwrite replaces them"
-        raise _common.UsageError(f"{existing[0]}: exists already{ending}; {advice}")
+        raise _common.UsageError(f"{existing[0]}: already exists{ending}; {advice}")
 
 
 def _build(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> JsonObject:
-    """Build and write one bundle; returns its description, as JSON values."""
+    """Build and write one bundle; return its description as a JSON object."""
     for path in paths:
         _common.require_file(path, *SUFFIXES)
     advice = ""
     if output.is_dir():
-        advice = f", got a folder; {output / subject_name(paths[0])}.v3dg is one"
+        advice = f", got a folder; {output / subject_name(paths[0])}.v3dg would be a file in it"
     check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
     _common.check_output(output, *paths)
     start = time.perf_counter()
@@ -347,7 +358,7 @@ def _build(
 
 
 def _notes(options: Build, paths: Sequence[Path]) -> list[str]:
-    """Lines about what the files of an asset declare."""
+    """Return lines about the declarations in the files of an asset."""
     config = _config_of(options)
     lines = []
     for path in paths:
@@ -370,7 +381,7 @@ def _build_file(
     if options.strict:
         unusable = "refuse"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AssetWarning)  # the result says it
+        warnings.simplefilter("ignore", AssetWarning)  # the result reports them
         return build_file(
             paths,
             output,
@@ -401,23 +412,23 @@ def _config_of(options: Build) -> BuildConfig:
 
 @contextmanager
 def _resume_advised(output: Path) -> Iterator[None]:
-    """Add to errors and interrupts of a build where it can continue."""
+    """Add to errors and interrupts of a build how it can be continued."""
     try:
         yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{_resume_advice(output)}") from None
     except SchedulerError as error:
         raise SchedulerError(f"{error}{_resume_advice(output)}") from None
-    except OSError as error:  # such as that of a full disk
-        if error.errno is None:  # the error of a URL, whose text is complete
+    except OSError as error:  # for example, the disk is full
+        if error.errno is None:  # an error about a URL, whose text is complete
             raise type(error)(f"{error}{_resume_advice(output)}") from None
         text = f"{error.strerror}{_resume_advice(output)}"
         raise OSError(error.errno, text, error.filename) from None
 
 
 def _resume_advice(output: Path) -> str:
-    """Return the end of the message about an unfinished build: from which file it can
-    continue."""
+    """Return the end of the message about an unfinished build: the file from which it
+    can be continued. Empty if there is no such file."""
     levels = levels_path(output)
     if levels.exists():
         return f"; `--resume` continues from {levels}"
@@ -425,12 +436,13 @@ def _resume_advice(output: Path) -> str:
 
 
 def _refine_advice(output: Path) -> str:
-    """The command that refines a draft, and what it takes."""
+    """Return a line with the command that refines a draft, and the time that it
+    takes."""
     refined = output.with_name(f"{output.stem}_refined.v3dg")
     command = shlex.join(["v3dg", "refine", str(output), str(refined)])
     return (
-        f"draft: `{command}` brings its levels closer to the asset, in seconds on a GPU or "
-        "minutes on a CPU"
+        f"draft: `{command}` makes its levels more similar to the asset; it takes seconds on a GPU "
+        "or minutes on a CPU"
     )
 
 

@@ -24,11 +24,11 @@ from v3dg.metrics import FLIP_MISSING, MIN_TRANSMITTANCE, draw_truth, error_imag
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
-# From this number of views on, measuring in other processes is faster, in spite of the
-# time to start them.
+# With at least this number of views, measuring in other processes is faster, in spite
+# of the time to start them.
 _ENOUGH_TO_SHARE = 6
 
-# Smaller pictures are enlarged to about this width, in px, when they are shown side by
+# Smaller pictures are enlarged to about this width in px when they are shown side by
 # side.
 _LEAST_WIDTH = 300
 
@@ -43,45 +43,45 @@ _COLUMNS = (
 
 @dataclass
 class Compare(_common.Cut, _common.OnDevice):
-    """Draw two subjects from the same cameras, or take two pictures, and measure their
-    difference.
+    """Measure the difference between pictures of two subjects, which are drawn for the
+    same cameras, or between two existing pictures.
 
-    The measures are PSNR and SSIM, and FLIP if the extra `flip` is installed.
+    PSNR and SSIM are measured, and FLIP if the extra `flip` is installed.
     """
 
     reference: tyro.conf.Positional[Path]
-    """An asset, a bundle (.v3dg) or a scene (.json), which is drawn with all gaussians;
-    or a picture (.png)."""
+    """An asset, a bundle (.v3dg) or a scene (.json), which is drawn with all its
+    gaussians; or a picture (.png, .jpg)."""
     test: tyro.conf.Positional[Path]
-    """The subject to compare with the reference, which is drawn with a tolerance; or a
-    picture of the same size."""
+    """The subject that is compared with the reference, which is drawn with a tolerance;
+    or a picture of the same size as the reference."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
-    """Picture to write, .png or .jpg, with the reference, the test and, if FLIP is
-    installed, its map."""
+    """Picture to write, .png or .jpg. It shows the reference, the test and, if FLIP is
+    installed, the map of FLIP."""
     pictures: Literal["worst", "all"] = "worst"
-    """Show the view that differs most, or write a picture of every view."""
+    """Write a picture of the view with the largest difference, or of every view."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Draw the reference this many times larger and average it; 2 avoids that aliasing
-    counts as detail."""
+    """Draw the reference this many times larger and average its pixels; with 2,
+    aliasing does not count as detail."""
     view: Views = field(default_factory=ViewOptions)
 
 
 class _Pair(NamedTuple):
-    """Two pictures of one view."""
+    """Two pictures of the same view."""
 
     name: str
     reference: Picture
     test: Picture
-    gaussians: int | None = None  # number of selected gaussians of the test
+    gaussians: int | None = None  # gaussians in the cut of the test
 
 
 @dataclass(frozen=True)
 class _Pairs:
-    """The pairs of pictures to compare, which are made one after another."""
+    """The pairs of pictures to compare, which are drawn one after another."""
 
     names: list[str]
     pairs: Iterator[_Pair]
-    finest: int | None  # gaussians of the test's finest level, if it is a bundle
+    finest: int | None  # number of gaussians in level 0 of the test, if it is a bundle
 
 
 def run(options: Compare) -> None:
@@ -91,7 +91,7 @@ def run(options: Compare) -> None:
     _files.make_folder(output)
     are_pictures = [beside(path).suffix.lower() in pictures.SUFFIXES for path in subjects]
     is_pair = any(are_pictures) == all(are_pictures)
-    _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")
+    _common.check_usage("PATH", is_pair, "two pictures or two subjects to draw, got one of each")
     if all(are_pictures):
         pairs = _read_pictures(options)
     else:
@@ -114,20 +114,21 @@ def run(options: Compare) -> None:
     lines = [
         *_common.table_lines(_COLUMNS, table_rows),
         "",
-        f"{worst['picture']}: {titles} of view {worst['camera']}, which differs most",
+        f"{worst['picture']}: {titles} of view {worst['camera']}, which has the largest difference",
     ]
     if mean["flip"] is None:
         lines.append(FLIP_MISSING)
     if pairs.finest is not None and all(row["gaussians_selected"] == pairs.finest for row in rows):
         lines.append(
-            "every view needs the finest level; a smaller `--size` shows the test as from far away"
+            "every view needs the finest level; with a smaller `--size`, the test is shown as "
+            "from farther away"
         )
     _common.print_result(result, lines, as_json=options.json)
 
 
 def _measure(options: Compare, pairs: _Pairs, output: Path) -> tuple[list[JsonObject], JsonObject]:
-    """Measure all pairs and write their pictures; the rows of the result, and the one
-    that differs most."""
+    """Measure all pairs and write their pictures; return the rows of the result, and
+    the row with the largest difference."""
     paths = [output] * len(pairs.names)
     if options.pictures == "all":
         paths = picture_paths(output, pairs.names)
@@ -160,14 +161,17 @@ def _read_pictures(options: Compare) -> _Pairs:
     test = pictures.read_picture(options.test)
     height, width, _ = reference.shape
     test_height, test_width, _ = test.shape
-    expected = f"{width} x {height} px like {options.reference}, got {test_width} x {test_height}"
+    expected = (
+        f"{width} x {height} px like {options.reference}, got {test_width} x {test_height}; "
+        "resize one of them"
+    )
     check(options.test, reference.shape == test.shape, expected)
     name = subject_name(options.test)
     return _Pairs([name], iter([_Pair(name, reference, test)]), finest=None)
 
 
 def _draw(options: Compare) -> _Pairs:
-    """Draw the pairs of pictures of all cameras."""
+    """Return the pairs of pictures for all cameras, to be drawn one after another."""
     options.view.check(options.reference, options.test)
     _common.check_range("--supersample", options.supersample, 1, 16)
     device = _device.resolve(options.device)
@@ -202,7 +206,7 @@ def _draw(options: Compare) -> _Pairs:
                 tolerance=options.tolerance,
                 budget=options.budget,
                 device=device,
-                # as for the reference, so that only the gaussians differ
+                # the same value as for the reference, so that only gaussians differ
                 min_transmittance=MIN_TRANSMITTANCE,
             )
             yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)
@@ -215,8 +219,8 @@ def _errors(pair: _Pair) -> dict[str, float | None]:
 
 
 def _difference(row: JsonObject) -> float:
-    """Return the key by which views are sorted: FLIP, or the negative PSNR if FLIP is
-    missing."""
+    """Return the key by which views are sorted: FLIP or, if it is missing, the negative
+    PSNR."""
     if row["flip"] is not None:
         return float(row["flip"])
     if row["psnr"] is not None:

@@ -13,28 +13,28 @@ import tyro
 from v3dg.cli._common import Common
 
 _Shell: TypeAlias = Literal["bash", "zsh", "fish"]
-# The completions of a command in the form of tyro's scripts: nested dicts and lists.
+# The completions of a command, in tyro's format: nested dicts and lists.
 _Spec: TypeAlias = dict[str, object]
 
-# Replacements in tyro's scripts that complete file names if neither a command nor an
-# option matches.
+# Replacements in tyro's scripts, so that file names are completed if neither a command
+# nor an option matches.
 _OR_FILES = {
     "bash": ("complete -F", "complete -o default -F"),
     "zsh": ('[[ "$completions" ==', '[[ -z "$completions" || "$completions" =='),
     "fish": ("complete --no-files", "complete"),
 }
-# The line of tyro's scripts that has all commands and options as a literal of Python.
+# The line of tyro's scripts that contains all commands and options as a Python literal.
 _SPEC = re.compile(r"^COMPLETION_SPEC = (.*)$", re.MULTILINE)
 _BASH_MATCH = 'matches+=("$completion")'
 
 
 @dataclass
 class Completion(Common):
-    """Print a shell script that completes commands, options and files (docs/install.md
-    says where to put it)."""
+    """Print a shell script that completes commands, options and file names
+    (docs/install.md describes how to install it)."""
 
     shell: tyro.conf.Positional[_Shell]
-    """Shell that will run the script."""
+    """The shell for the script."""
 
 
 def run(options: Completion) -> None:
@@ -44,7 +44,7 @@ def run(options: Completion) -> None:
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         parse(["--tyro-write-completion", options.shell, "-"])
     text = _plain(script.getvalue(), options.shell).replace(*_OR_FILES[options.shell])
-    # An empty answer is no match, so that files are completed.
+    # An empty completion must not count as a match, so that file names are completed.
     text = text.replace(_BASH_MATCH, f'[[ -z "$completion" ]] || {_BASH_MATCH}')
     if options.json:
         text = json.dumps({"shell": options.shell, "script": text})
@@ -56,9 +56,11 @@ def _plain(script: str, shell: _Shell) -> str:
     as a value of optional options."""
     match = _SPEC.search(script)
     if match is None:
-        raise RuntimeError("completion: tyro wrote another script; install an earlier tyro")
+        raise RuntimeError(
+            "completion: tyro wrote an unknown kind of script; install an earlier version of tyro"
+        )
     literal = match[1]
-    if shell == "fish":  # whose script is in double quotes
+    if shell == "fish":  # the script for fish is in double quotes
         literal = re.sub(r"\\(.)", r"\1", literal)
     spec = cast(_Spec, ast.literal_eval(literal))
     _simplify(spec)
@@ -69,7 +71,8 @@ def _plain(script: str, shell: _Shell) -> str:
 
 
 def _simplify(spec: _Spec) -> None:
-    """Take the help and None out of the spec of a command, and of those below it."""
+    """Remove help texts and None from the completions of a command and of its
+    subcommands."""
     spec["description"] = ""
     for option in cast(list[_Spec], spec["options"]):
         option["description"] = ""

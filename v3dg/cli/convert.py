@@ -32,12 +32,12 @@ from v3dg.upright import ASSUMED, turned_upright, up_of
 
 @dataclass
 class ConvertViews(ViewOptions):
-    """The cameras of cuts, and the axis that is up in the input."""
+    """Options for the cameras of cuts, and for the up axis of the input."""
 
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that is up in the input, which is turned to -y. By default the one that
-    `v3dg info` shows: outputs that have axes, .spz, .glb and .usd, are turned from it,
-    and others keep it."""
+    """The axis of the input that points up; gaussians are rotated so that it becomes
+    -y. By default it is the axis that `v3dg info` shows, and only outputs with defined
+    axes (.spz, .glb and .usd) are rotated."""
 
 
 _Views: TypeAlias = Annotated[ConvertViews, tyro.conf.OmitArgPrefixes]
@@ -45,26 +45,26 @@ _Views: TypeAlias = Annotated[ConvertViews, tyro.conf.OmitArgPrefixes]
 
 @dataclass
 class Convert(_common.Cut, _common.Common):
-    """Write an asset, a level of a bundle, or its cut for a camera, in another format;
-    or a bundle with another codec."""
+    """Write an asset, a level of a bundle, or a cut for a camera in another format; or
+    write a bundle with another codec."""
 
     subject: tyro.conf.Positional[Path]
     """An asset in any readable format (docs/formats.md), a bundle (.v3dg) or a scene
     (.json)."""
     output: tyro.conf.Positional[Path]
-    """File to write, .ply, .compressed.ply, .spz, .sog, .glb or .usd; for a bundle also
-    .v3dg, with all its levels."""
+    """File to write: .ply, .compressed.ply, .spz, .sog, .glb or .usd; or .v3dg, if the
+    subject is a bundle, with all its levels."""
     codec: Annotated[
         Literal["float32", "quantized"] | None, _common.option("{float32,quantized}")
     ] = None
-    """Codec of a .v3dg output, as for `v3dg build`; by default that of the bundle."""
+    """Codec of a .v3dg output, see `v3dg build`; by default that of the input."""
     level: Annotated[int | None, _common.option("N")] = None
-    """Write this level of a bundle; by default 0, the asset itself, unless other
-    options choose a cut."""
+    """Write this level of a bundle. By default it is 0, the asset itself, unless other
+    options select a cut."""
     outside: Literal["drop", "keep"] = "drop"
-    """Drop or keep the part of the cut that the camera does not see."""
+    """Whether to drop or keep the part of the cut that the camera does not see."""
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
-    """Version of a .spz; 3 by default."""
+    """Version of a .spz output; 3 by default."""
     moves: Moves = field(default_factory=MoveOptions)
     edits: Edits = field(default_factory=EditOptions)
     faults: Faults = field(default_factory=FaultOptions)
@@ -73,14 +73,14 @@ class Convert(_common.Cut, _common.Common):
 
 @dataclass(frozen=True)
 class _Part:
-    """The gaussians to write, and the fields of the result that describe them."""
+    """The gaussians to write, and the entries of the result that describe them."""
 
     gaussians: Gaussians
     description: dict[str, object]
 
 
 def run(options: Convert) -> None:
-    # What is up is an option for every input, not only for the turntable.
+    # --up applies to every input, not only to views around the subject.
     replace(options.view, up=None).check(options.subject)
     options.moves.check()
     options.edits.check()
@@ -89,11 +89,11 @@ def run(options: Convert) -> None:
     _check_output(options)
     part_options = _part_options(options)
     is_cut = is_scene(options.subject) or any(name != "--level" for name in part_options)
-    expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
+    expected = "no scene, camera, tolerance or budget together with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AssetWarning)  # the result says it
+        warnings.simplefilter("ignore", AssetWarning)  # the result reports them
         subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
     output = options.output
     notes: list[str] = []
@@ -123,8 +123,8 @@ def run(options: Convert) -> None:
 def _written(
     options: Convert, subject: Subject, part: _Part, editor: Editor, notes: list[str]
 ) -> _Part:
-    """Join, move, trim, check and write a part; adds lines about what was turned and
-    lost, and returns what was written."""
+    """Join, move, trim, check and write a part. Append lines to `notes` about rotations
+    and losses; return the written part."""
     output = options.output
     name = shown(options.subject)
     if isinstance(subject, Gaussians):
@@ -135,7 +135,7 @@ def _written(
     up, reason = up_of(subject)
     if options.view.up is not None:
         gaussians = turned_upright(gaussians, options.view.up)
-        reason = f"turned from {options.view.up}, as --up says"
+        reason = f"rotated from {options.view.up}, as requested by --up"
         up = "-y"
     gaussians = options.moves.moved(editor.joined(gaussians))
     if options.moves.rotate is not None and "guessed" in reason:
@@ -160,14 +160,14 @@ def _written(
 
 
 def _lines_of_up(name: str, output: Path, up: Axis, reason: str) -> list[str]:
-    """Return lines that say what is up, and what was turned for the output."""
+    """Return lines about the up axis, and about its rotation in the output."""
     up_in_file = turned_up(output)
     if up_in_file is not None:
-        text = f"{name}: {up} is up, {reason}; {output.name} is turned so that {up_in_file} is"
+        text = f"{name}: {up} is up, {reason}; {output.name} is rotated so that {up_in_file} is up"
         return [f"{text}; change it with --up"]
     if up != "-y":
         text = f"{name}: {up} is up, {reason}; {output.name} keeps it"
-        return [f"{text}, where most viewers take -y for up; --up {up} turns it"]
+        return [f"{text}, while most viewers assume -y; --up {up} rotates it"]
     if reason != ASSUMED:
         return [f"{name}: {up} is up, {reason}"]
     return []
@@ -178,8 +178,8 @@ def _is_bundle(path: Path) -> bool:
 
 
 def _check_output(options: Convert) -> None:
-    """Refuse an output that cannot be written, and options that do not apply to its
-    format."""
+    """Raise an error for an output that cannot be written, and for options that do not
+    apply to its format."""
     output = options.output
     name = output.name.lower()
     suffixes = (*WRITE_SUFFIXES, ".v3dg")
@@ -187,14 +187,13 @@ def _check_output(options: Convert) -> None:
     fits = options.codec is None or _is_bundle(output)
     _common.check_usage("--codec", fits, f"an output that ends in .v3dg, got {output}")
     fits = not options.spz_version or name.endswith(".spz")
-    _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
+    _common.check_usage("--spz-version", fits, f"a .spz as output, got {output}; leave it out")
     _common.check_output(output, options.subject, *options.edits.added_paths())
     _files.make_folder(output)
 
 
 def _part_options(options: Convert) -> list[str]:
-    """Return the names of the options on the command line that ask for a level or a
-    cut."""
+    """Return the names of the given options that select a level or a cut."""
     values = {
         "--level": options.level,
         "--tolerance": options.tolerance,
@@ -211,8 +210,8 @@ def _write_bundle(options: Convert, subject: Subject, part_options: list[str]) -
         changes.append("--up")
     if not isinstance(subject, Bundle) or changes:
         raise _common.UsageError(
-            f"{options.output}: expected a bundle as the input, without options that choose a part "
-            "of it or change it; v3dg build makes a bundle from an asset"
+            f"{options.output}: expected a bundle as input, without options that select or change "
+            "a part of it; `v3dg build` makes a bundle from an asset"
         )
     codec = options.codec or subject.codec
     Bundle(subject.clusters, subject.groups, subject.gaussians, subject.config, codec).write(
@@ -231,7 +230,7 @@ def _part(
 ) -> _Part:
     """Return the asset, a level of the bundle, or a cut."""
     if isinstance(subject, Gaussians):
-        expected = "a bundle or a scene; build one first"
+        expected = "a bundle or a scene, got an asset; build a bundle from it"
         _common.check_usage(", ".join(part_options), not part_options, expected)
         return _Part(subject, {})
     if isinstance(subject, Bundle) and not is_cut:
@@ -250,7 +249,7 @@ def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camer
     option_name = "--camera"
     if options.view.views:
         option_name = "--views"
-    expected = f"one camera to look from, got {len(cameras)}; choose one"
+    expected = f"exactly one camera, got {len(cameras)}; choose one"
     _common.check_usage(option_name, len(cameras) == 1, expected)
     name, camera = next(iter(cameras.items()))
     selection = select(
@@ -261,7 +260,8 @@ def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camer
         cull=options.outside == "drop",
         device=CPU,
     )
-    if isinstance(subject, Bundle) and len(selection):  # reads only the clusters of the cut
+    # Only pages with clusters of the cut are read.
+    if isinstance(subject, Bundle) and len(selection):
         gaussians = Gaussians.concatenate(
             [subject.cluster_gaussians(int(c)) for c in selection.cluster_ids]
         )

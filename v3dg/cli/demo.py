@@ -32,23 +32,24 @@ _COLUMNS = [
 
 @dataclass
 class Demo(Common):
-    """Make an asset, build and place it 2,000 times, draw it from near to far, and
-    measure."""
+    """Make an asset, build its bundle, place 2,000 instances, draw them at several
+    distances, and measure the pictures."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("v3dg_demo.png")
     """Picture to write, .png or .jpg."""
     keep: Annotated[Path | None, option("FOLDER")] = None
-    """Keep the asset, its bundle and the scene in this folder, to go on with."""
+    """Store the asset, its bundle and the scene in this folder for further use."""
     gaussians: int = 50_000
-    """Gaussians of the asset."""
+    """Number of gaussians in the asset."""
     instances: int = 2000
     """Number of instances of the asset."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (380, 440)
-    """Width and height of one panel in px."""
+    """Width and height of a panel in px."""
     tolerance: float = DEFAULT_TOLERANCE
-    """Screen area in px² that one gaussian of a coarser cluster may stand for."""
+    """Largest screen area in px² that one gaussian of a coarser cluster may stand
+    for."""
     seed: int = 0
-    """Seed of the asset, of the field and of the build."""
+    """Seed of the asset, of its placement and of the build."""
 
 
 def run(options: Demo) -> None:
@@ -87,7 +88,7 @@ def run(options: Demo) -> None:
 
 
 def _advice(files: Sequence[str]) -> list[str]:
-    """Return the lines that say what to do with files that were kept."""
+    """Return lines with commands for the files that were kept."""
     if not files:
         return []
     asset, bundle, scene = map(shlex.quote, files)

@@ -17,13 +17,13 @@ from v3dg._extras import EXTRAS
 from v3dg._version import __version__
 from v3dg.cli._common import Common, print_result
 
-_PATIENCE_S = 20  # time for a program to answer
+_PATIENCE_S = 20  # time limit in seconds for the answer of a program
 
 
 @dataclass
 class Doctor(Common):
-    """List the software and hardware that v3dg can use, and the purpose and source of
-    missing parts."""
+    """List the software and hardware that v3dg can use. For missing parts, print their
+    purpose and how to get them."""
 
 
 def run(options: Doctor) -> None:
@@ -43,11 +43,11 @@ def run(options: Doctor) -> None:
 
 
 class _Finding(NamedTuple):
-    """A part of the machine that v3dg can use."""
+    """A part of the machine's software or hardware that v3dg can use."""
 
     part: str
     version: str | None  # a description of the installed part; None if it is missing
-    advice: str  # the purpose of a missing part, and how to get it
+    advice: str  # the purpose of the part, and how to get it
 
 
 def _findings() -> Iterator[_Finding]:
@@ -67,7 +67,9 @@ def _findings() -> Iterator[_Finding]:
     advice = "12.4 or newer, to build with CUDA: https://developer.nvidia.com/cuda-downloads"
     yield _Finding("CUDA toolkit", _answer(nvcc, "--version", line=-2), advice)
     gpu = _answer("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
-    yield _Finding("GPU, driver", gpu, "to draw and build with CUDA; the CPU can do all of it, too")
+    yield _Finding(
+        "GPU, driver", gpu, "to draw and build with CUDA; the CPU can do the same, but slower"
+    )
     missing = _device.missing_for_cuda()
     status = None
     if not missing:
@@ -82,13 +84,15 @@ def _findings() -> Iterator[_Finding]:
     browser = None
     with contextlib.suppress(webbrowser.Error):
         browser = getattr(webbrowser.get(), "name", "there")
-    advice = "or no screen: open the address that `v3dg view` prints in any browser"
+    advice = (
+        "if there is no browser or no screen, open the address that `v3dg view` prints in any "
+        "browser"
+    )
     yield _Finding("web browser", browser, advice)
 
 
 def _answer(*command: str, line: int = 0) -> str | None:
-    """Return a line of the output of a program; None if the program is missing or
-    fails."""
+    """Return a line of a program's output; None if the program is missing or fails."""
     with contextlib.suppress(OSError, subprocess.SubprocessError, IndexError):
         process = subprocess.run(
             command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True

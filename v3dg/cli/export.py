@@ -26,24 +26,26 @@ class Export(_common.Common):
     """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD
     (docs/formats.md).
 
-    The folder may be new, empty, or have an earlier export. Only unchanged files that
-    its v3dg-export.json lists are replaced or removed. The inputs must not be in it."""
+    The folder may be new, empty, or contain an earlier export. Only unchanged files
+    that are listed in its v3dg-export.json are replaced or removed. The inputs must not
+    be in this folder.
+    """
 
     subject: tyro.conf.Positional[Path]
-    """A scene (.json), a bundle (.v3dg), or a world of OpenUSD."""
+    """A scene (.json), a bundle (.v3dg), or an OpenUSD file with instances."""
     output: Annotated[Path | None, _common.option("FOLDER", "-o")] = None
-    """Folder to write, which is created if needed; by default the subject's name with
-    _web. A name that ends in .usd, .usda or .usdc is a file."""
+    """Folder to write, which is created if needed; by default the name of the subject
+    followed by _web. A name that ends in .usd, .usda or .usdc is a file."""
     to: Literal["sog", "tiles"] = "sog"
-    """Streamed SOG, for PlayCanvas and SuperSplat, or 3D Tiles, for CesiumJS."""
+    """Streamed SOG for PlayCanvas and SuperSplat, or 3D Tiles for CesiumJS."""
     chunk: int = export.DEFAULT_CHUNK
-    """Largest number of gaussians of an asset in a chunk of streamed SOG; the viewer
-    chooses a level for each chunk."""
+    """Largest number of gaussians of an asset in a chunk of streamed SOG. Viewers
+    choose a level for each chunk."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that is up; by default the one in the file, or a guess from it or its
-    cameras."""
+    """The axis that points up; by default the one in the file, or a guess from the
+    gaussians or the cameras."""
     overwrite: _common.Flag = False
-    """Write to any folder, and replace files of the same names. No other file is
+    """Write to any folder, and replace files with the same names. No other file is
     removed, and no folder or link is replaced."""
 
 
@@ -57,13 +59,14 @@ def run(options: Export) -> None:
     _common.check_usage(
         "--to",
         options.to == "sog" or not is_usd,
-        f"none for {folder}, got {options.to}; leave it out",
+        f"no value for {folder}, whose suffix determines the format, got {options.to}; leave it "
+        "out",
     )
     start = time.perf_counter()
     subject, cameras = _common.open_subject(options.subject, show=not options.quiet)
     if isinstance(subject, Gaussians):
         name = shown(options.subject)
-        advice = f"build a bundle from it: v3dg build {name}"
+        advice = f"build a bundle from it with v3dg build {name}"
         raise ValueError(f"{name}: expected a scene or a bundle, got an asset; {advice}")
     up, notes = choose_up(options.up, subject, cameras, options.subject)
     if is_usd:
@@ -85,11 +88,11 @@ def run(options: Export) -> None:
 
 @dataclass(frozen=True)
 class _Written:
-    """An export to a folder."""
+    """A finished export to a folder."""
 
     export: export.Site | export.Tiles
-    text: str  # its content
-    needs: Sequence[str]  # commands that bring the missing engine to the folder
+    text: str  # a description of the content
+    needs: Sequence[str]  # commands that install a missing engine in the folder
 
 
 def _write_tiles(options: Export, subject: Scene | Bundle, folder: Path, up: Axis) -> _Written:
@@ -133,17 +136,17 @@ def _lines(folder: Path, written: _Written, seconds: float) -> list[str]:
 
 
 def _advice(folder: Path, written: _Written) -> list[str]:
-    """Return the lines that say how to open an export in a browser."""
+    """Return lines about opening an export in a browser."""
     quoted = shlex.quote(str(folder))
     lines = []
     if written.needs:
-        lines.append("the page needs its engine in the same folder:")
+        lines.append("the page needs its engine in the same folder; these commands install it:")
         lines += [f"  {line.format(quoted)}" for line in written.needs]
-    lines.append(f"to look at it: python -m http.server --bind 127.0.0.1 --directory {quoted}")
+    lines.append(f"to view it, run: python -m http.server --bind 127.0.0.1 --directory {quoted}")
     lines.append("  then open http://127.0.0.1:8000/")
     return lines
 
 
 def _web_folder(subject: Path) -> Path:
-    """The default folder of a page."""
+    """Return the default folder of an export."""
     return beside(subject).with_name(f"{subject_name(subject)}_web")

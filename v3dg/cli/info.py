@@ -24,10 +24,11 @@ from v3dg.levels import BuildConfig
 from v3dg.scene import Scene, Subject
 from v3dg.upright import direction_of, up_of
 
-# JSON values, and lines of text.
+# A description as a JSON object, and as lines of text.
 _Description: TypeAlias = tuple[JsonObject, list[str]]
 
-_MOST_SHOWN = 20  # cameras in a list: with hundreds, nothing else is left on the screen
+# Maximum number of listed cameras, so that the other lines stay on the screen.
+_MOST_SHOWN = 20
 
 
 @dataclass
@@ -59,12 +60,12 @@ def run(options: Info) -> None:
 
 
 def _first_view(subject: Subject, up: Axis) -> tuple[JsonObject | None, str]:
-    """Return the camera that first shows a subject, also in `v3dg render` and the
-    viewer; None if pages that it needs are damaged."""
+    """Return the camera that shows a subject by default, in `v3dg render` and in the
+    viewer, too; None if pages that it needs are damaged."""
     try:
         framing = frame_subject(subject)
     except (OSError, ValueError) as error:
-        return None, f"first view unknown: {error}"
+        return None, f"first view unknown ({error})"
     camera = framing.camera(direction_of(up), 800, 800)
     eye = camera.position.tolist()
     target = framing.focus(camera).tolist()
@@ -113,20 +114,21 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
 
 
 def _fault_lines(findings: Findings, num_unrotated: int) -> list[str]:
-    """Lines about gaussians that cannot be drawn, or not as their file means it."""
+    """Return lines about gaussians that cannot be drawn, or that are drawn without
+    their rotation."""
     lines = []
     if findings.counts:
         lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
     if num_unrotated:
         lines.append(
-            f"{num_unrotated:,} with a rotation of length zero, drawn unrotated; "
-            "convert --drop-bad leaves them out"
+            f"{num_unrotated:,} with a rotation of length zero, drawn without rotation; convert "
+            "--drop-bad leaves them out"
         )
     return lines
 
 
 def _extent_lines(result: JsonObject) -> list[str]:
-    """Return lines about the positions of the gaussians that can be drawn."""
+    """Return lines about the positions of drawable gaussians."""
     lines = []
     if result["drawable"]:
         lines.append("means from {} to {}".format(*map(_point, result["box"])))
@@ -142,7 +144,7 @@ def _extent_lines(result: JsonObject) -> list[str]:
 
 
 def _spread_lines(spread: Mapping[str, Sequence[float]]) -> list[str]:
-    """Return a line about the percentiles of each value."""
+    """Return lines about the percentiles of values."""
     lines = []
     for name, (p5, p50, p95) in spread.items():
         text = name.replace("_", " ")
@@ -151,7 +153,8 @@ def _spread_lines(spread: Mapping[str, Sequence[float]]) -> list[str]:
 
 
 def _box(means: Array) -> list[list[float]]:
-    """Lower and upper corner of positions; nothing for none."""
+    """Return the minimum and the maximum corner of positions; empty if there are
+    none."""
     if not len(means):
         return []
     return [means.min(axis=0).tolist(), means.max(axis=0).tolist()]
@@ -185,7 +188,7 @@ def _bundle_info(bundle: Bundle) -> _Description:
         "",
         *_common.table_lines(columns, levels),
         "",
-        "errors: mean residual of the fits per pixel, at the size at which a level is drawn",
+        "errors: mean error per pixel of the fits, at the size at which a level is drawn",
     ]
     if bundle.config:
         text = _common.printable(_config_text(bundle.config))
@@ -194,7 +197,7 @@ def _bundle_info(bundle: Bundle) -> _Description:
 
 
 def _config_text(config: JsonObject) -> str:
-    """The settings of a build that are not the default ones."""
+    """Return a line about the settings of a build that differ from the defaults."""
     defaults = asdict(BuildConfig().of_asset(antialiased=None))
     changes = []
     for name, value in _settings(config):
@@ -204,12 +207,12 @@ def _config_text(config: JsonObject) -> str:
                 text = json.dumps(value)
             changes.append(f"{name}={text}")
     if not changes:
-        return "built by default"
-    return f"built with {', '.join(changes)}, all else by default"
+        return "built with default settings"
+    return f"built with {', '.join(changes)}; all other settings are the defaults"
 
 
 def _leaves(bundle: Bundle) -> int:
-    """Gaussians of level 0."""
+    """Return the number of gaussians in level 0."""
     if not len(bundle.level_range(0)):
         return 0
     return _common.level_size(bundle, 0)
@@ -251,13 +254,13 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
     if sizes:
         lines += ["", *_common.table_lines(camera_columns, sizes[:_MOST_SHOWN])]
     if len(sizes) > _MOST_SHOWN:
-        lines += [f"and {len(sizes) - _MOST_SHOWN:,} more; --json has all"]
+        lines += [f"and {len(sizes) - _MOST_SHOWN:,} more; --json lists all"]
     return result, lines
 
 
 def _settings(config: JsonObject, prefix: str = "") -> Iterator[tuple[str, Json]]:
-    """Yield names and values of a bundle's config; the names of nested settings, except
-    for those of the build, have a prefix."""
+    """Yield the names and values in a bundle's config. Names in nested objects are
+    prefixed, except those of the build's settings."""
     for name, value in config.items():
         if isinstance(value, dict):
             nested_prefix = f"{name} "

@@ -24,7 +24,8 @@ from v3dg.refine import refine_bundle
 from v3dg.render import render
 from v3dg.upright import direction_of, up_of
 
-# Widths of the pictures by which the result is judged, and how many of each.
+# The result is judged by pictures of these widths in px, for this number of cameras
+# each.
 _WIDTHS = (512, 128, 32)
 _MOST_CAMERAS = 4
 _NOTICED_DB = 0.05
@@ -32,24 +33,24 @@ _NOTICED_DB = 0.05
 
 @dataclass(kw_only=True)
 class Refine(CameraFile, _common.OnDevice):
-    """Make the levels of a bundle look more like its asset at all sizes, which takes
-    far longer than building it."""
+    """Make the levels of a bundle more similar to its asset. This takes much longer
+    than building it."""
 
     bundle: tyro.conf.Positional[Path]
-    """Bundle that `v3dg build` made (.v3dg)."""
+    """Bundle (.v3dg) that `v3dg build` wrote."""
     output: tyro.conf.Positional[Path]
     """Bundle to write (.v3dg)."""
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000
     """Number of pictures of cuts that are compared with pictures of the asset."""
     cameras: Annotated[Path | None, _common.option("PATH")] = None
-    """A file or folder of cameras, as for `v3dg render`, for assets such as a room,
-    which is seen from inside. By default the asset is seen from all around."""
+    """File or folder of cameras, as for `v3dg render`. Use it for assets that are seen
+    from inside, such as a room. By default, the asset is seen from all directions."""
     drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
-    """Drop the least visible gaussians of each level, up to this share of the level's
-    visibility; 0 keeps all."""
+    """Share of a level's visibility that may be lost by dropping its least visible
+    gaussians; 0 keeps all."""
     seed: int = 0
-    """Seed of random numbers; the same seed gives the same file, byte for byte, on the
-    same kind of device, with any number of threads."""
+    """Seed of random numbers. The same seed gives the same file, byte for byte, on the
+    same kind of device and for any number of threads."""
 
 
 def run(options: Refine) -> None:
@@ -91,7 +92,7 @@ def run(options: Refine) -> None:
 
 
 def _compared(bundle: Bundle, refined: Bundle, options: Refine) -> Iterator[JsonObject]:
-    """Yield the mean PSNR of pictures before and after refining, for each picture width
+    """Yield the mean PSNR of pictures before and after the refinement, for each width
     from large to small."""
     cameras = list(options.read().values())[:_MOST_CAMERAS]
     up = direction_of(up_of(bundle)[0])
@@ -114,7 +115,7 @@ def _compared(bundle: Bundle, refined: Bundle, options: Refine) -> Iterator[Json
 
 
 def _resized(camera: Camera, width: int) -> Camera:
-    """Return a camera with the same field of view and a picture of this width."""
+    """Return a camera with the same field of view for a picture of this width."""
     height = max(round(camera.height * width / camera.width), 1)
     scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
     return replace(camera, K=camera.K * scale, width=width, height=height)
@@ -125,10 +126,11 @@ def _psnr(mean_square: float) -> float:
 
 
 def _warning(rows: list[JsonObject]) -> list[str]:
-    """Return a line that says in which sizes the result is worse."""
+    """Return lines about the widths of pictures at which the result is worse; empty if
+    there are none."""
     worse = [str(row["width"]) for row in rows if row["after"] < row["before"] - _NOTICED_DB]
     if not worse:
         return []
     sizes = ", ".join(worse)
-    advice = "more --steps make it better; keep the bundle that was refined"
+    advice = "use more --steps, and keep the original bundle"
     return ["", f"worse than before at {sizes} px: {advice}"]

@@ -41,40 +41,43 @@ from v3dg.select import DEFAULT_FADE, CutOptions
 from v3dg.upright import direction_of
 from v3dg.video import write_video
 
-_MOST_SECONDS = 600.0  # a path of the viewer may last as long
+_MOST_SECONDS = 600.0  # the same limit as for camera paths of the viewer
 
 
 @dataclass
 class Render(Cut, OnPool):
-    """Draw a scene, a bundle or an asset: from its own cameras, from those of a camera
-    file, from a given position, or else from first views that show all of it."""
+    """Draw a scene, a bundle or an asset. The cameras are those of its file, those of
+    --cameras, one at a given position, or else first views that show the whole
+    subject."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
-    """Picture to write, .png or .jpg, or film, .mp4; several pictures get a number or
-    the camera's name. By default the name is that of the subject."""
+    """Picture (.png or .jpg) or film (.mp4) to write. The names of several pictures
+    also contain a number or the name of the camera. By default, the picture is named
+    after the subject."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Draw no level finer than this, except where an asset has no coarser one."""
+    """Draw no level finer than this, except for bundles with fewer levels."""
     fade: Annotated[float | None, option("FACTOR")] = None
     """Blend two levels within this factor of the tolerance, and draw level 0 with a
-    low-pass filter, so that a film neither pops nor flickers. By default 1.02 for
-    several views around the subject and for a film, otherwise 1, which turns it off."""
+    low-pass filter, so that a film neither pops nor flickers. The default is 1.02 for
+    films and for several views around the subject, otherwise 1, which means no
+    blending."""
     color_by: ColorBy = "appearance"
-    """Property that the colours show."""
+    """The property that colours represent."""
     background: Annotated[
         tuple[float, float, float] | str, tyro.conf.arg(metavar="R G B|COLOR|none")
     ] = (0.0, 0.0, 0.0)
     """Background: red, green and blue from 0 to 1, a colour such as white or #87ceeb,
-    or none for a .png that is transparent (straight alpha)."""
+    or none for a transparent .png (straight alpha)."""
     projection: Literal["pinhole", "equirectangular"] = "pinhole"
-    """Draw what the camera sees, or all directions around it, for which --size has
-    twice as much width as height."""
+    """Draw the view of the camera, or all directions around it. For all directions, the
+    width in --size must be twice the height."""
     fps: Annotated[int, tyro.conf.arg(metavar="N")] = 30
-    """Pictures a second of a film."""
+    """Pictures per second of a film."""
     seconds: Annotated[float | None, option("S")] = None
-    """Length of a film along a smooth curve through the cameras, at an even pace; by
-    default a film has one picture of each camera."""
+    """Duration of a film in seconds, along a smooth curve through the cameras at
+    constant speed. By default, a film has one picture for each camera."""
     view: Views = field(default_factory=ViewOptions)
 
     @property
@@ -88,11 +91,11 @@ class Render(Cut, OnPool):
 
 @dataclass(frozen=True)
 class _Style:
-    """How pictures are drawn, beside their cameras.
+    """Properties that are common to all pictures of a command.
 
     Attributes:
-        background: Colour behind the gaussians; None leaves pictures transparent.
-        up: The axis that is up, for panoramas.
+        background: The colour behind the gaussians; None for transparent pictures.
+        up: The axis that points up, for panoramas.
     """
 
     background: Color | None
@@ -120,8 +123,8 @@ def run(options: Render) -> None:
     if fade is None and is_sequence:
         fade = DEFAULT_FADE
     style = _Style(background, fade, options.view.up or "z")
-    # The pictures of a fade are a sequence, in which the tolerance of a budget changes
-    # in steps.
+    # With a fade, pictures count as a sequence, in which the tolerance of a budget
+    # changes in steps.
     renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
     pictures: list[JsonObject] = []
     drawn = _drawn(options, renderer, cameras, style, pictures)
@@ -154,34 +157,42 @@ def _print(options: Render, pictures: list[JsonObject], notes: list[str], output
 
 
 def _checked_output(options: Render, background: Color | None) -> Path:
-    """Return the file to write, which can be written. Options that do not go with it
-    are refused before anything is read."""
+    """Return the path of the output. Before anything is read, raise an error if it
+    cannot be written, or if options do not apply to it."""
     output = options.output or Path(f"{subject_name(options.subject)}.png")
     check_output(output, options.subject)
-    check_usage("--fps", 1 <= options.fps <= 1000, f"1 to 1000, got {options.fps}")
+    check_usage("--fps", 1 <= options.fps <= 1000, f"a number from 1 to 1000, got {options.fps}")
     if options.seconds is not None:
-        check_usage("--seconds", options.is_film, f"a film (.mp4) beside it, got {output}")
+        check_usage(
+            "--seconds", options.is_film, f"a film (.mp4) as output, got {output}; leave it out"
+        )
         check_range("--seconds", options.seconds, 0.1, _MOST_SECONDS)
     if options.is_panorama:
         width, height = options.view.size
         fits = width == 2 * height and width >= 8
-        advice = "--size 2048 1024 is one"
-        check_usage("--size", fits, f"twice the height as width, got {width} x {height}; {advice}")
+        advice = "for example, use --size 2048 1024"
+        check_usage(
+            "--size", fits, f"a width of twice the height, got {width} x {height}; {advice}"
+        )
     if options.is_film:
-        check_usage("--background", background, "a colour for a film, got none")
+        check_usage("--background", background, "a colour for a film, got none; choose one")
         _extras.load("av")
         _files.make_folder(output)
         _files.status_of_replaced(output)
     else:
         output = check_picture_path(output)
         is_png = output.suffix.lower() == ".png"
-        check_usage("--background", background or is_png, f"a .png for none, got {output}")
+        check_usage(
+            "--background",
+            background or is_png,
+            f"a .png for a transparent background, got {output}; choose a colour or a .png",
+        )
         _files.make_folder(output)
     return output
 
 
 def _check_sizes(options: Render, cameras: Mapping[str, Camera]) -> None:
-    """Refuse pictures of which no film can be made."""
+    """Raise an error for pictures that cannot form a film."""
     if options.is_panorama:
         check_size("--size", *options.view.size)
     if not options.is_film:
@@ -192,18 +203,18 @@ def _check_sizes(options: Render, cameras: Mapping[str, Camera]) -> None:
     width, height = min(sizes)
     fits = len(sizes) == 1 and width % 2 == 0 and height % 2 == 0
     texts = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)[:3])
-    expected = f"pictures of one size for a film, with even sides, got {texts}"
+    expected = f"pictures with equal and even sizes for a film, got {texts}"
     check_usage(str(options.output), fits, expected)
 
 
 def _flight(cameras: Mapping[str, Camera], seconds: float, fps: int) -> dict[str, Camera]:
-    """Return the cameras of a film along a smooth curve through these, which have one
-    size."""
+    """Return the cameras of a film along a smooth curve through these cameras, which
+    all have the same size."""
     from v3dg.viewer.path import CameraPath
     from v3dg.viewer.view import View
 
     names = ", ".join(cameras)
-    check_usage("--seconds", len(cameras) > 1, f"two or more cameras, got only {names}")
+    check_usage("--seconds", len(cameras) > 1, f"at least two cameras, got only {names}")
     path = CameraPath.through([View.of_camera(camera) for camera in cameras.values()], seconds)
     first = next(iter(cameras.values()))
     near = min(camera.near for camera in cameras.values())
@@ -211,14 +222,14 @@ def _flight(cameras: Mapping[str, Camera], seconds: float, fps: int) -> dict[str
 
 
 def _lines_of_faults(path: Path, subject: Subject) -> list[str]:
-    """Return a line that says how many gaussians of an asset have wrong values, which
-    are not drawn; no line without any."""
+    """Return a line about the number of gaussians with invalid values, which are not
+    drawn; no line if there are none."""
     if not isinstance(subject, Gaussians):
         return []
     findings = examine(subject)
     if not findings.num_wrong:
         return []
-    return [f"{shown(path)}: {findings.text}; `v3dg info` says more"]
+    return [f"{shown(path)}: {findings.text}; `v3dg info` describes them"]
 
 
 def _drawn(
@@ -228,7 +239,7 @@ def _drawn(
     style: _Style,
     pictures: list[JsonObject],
 ) -> Iterator[Image]:
-    """Draw the picture of each camera, and append its description to `pictures`."""
+    """Yield the picture of each camera, and append its description to `pictures`."""
     show = len(cameras) > 1 and not options.quiet
     cut = CutOptions(
         tolerance=options.tolerance,
@@ -259,7 +270,8 @@ def _drawn(
 
 
 def _costs(faces: list[RenderedImage]) -> JsonObject:
-    """Return the costs of a picture; for a panorama, they are sums over its sides."""
+    """Return the costs of a picture. For a panorama, they are the sums over its
+    sides."""
     stats = [face.stats for face in faces]
     costs: JsonObject = stats[0]._asdict()
     for name in ("gaussians_selected", "gaussians_in_frustum", "select_ms", "draw_ms"):

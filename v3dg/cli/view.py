@@ -42,31 +42,31 @@ from v3dg.upright import ASSUMED, direction_of, up_of
 if TYPE_CHECKING:
     from v3dg.viewer.server import Site
 
-# Time between checks for a signal: an endless wait would miss a signal that arrives
+# Time between two checks for a signal. An endless wait could miss a signal that arrives
 # just before it.
 _SECONDS = 0.1
 
 
 @dataclass
 class View(CameraFile, Cut, OnPool):
-    """Look at a scene, a bundle or an asset in a web browser."""
+    """Show a scene, a bundle or an asset in a web browser."""
 
     subject: tyro.conf.Positional[Path]
-    """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
+    """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     host: str = "127.0.0.1"
-    """Address of the server; by default only this machine can connect, with 0.0.0.0
-    everybody who has the URL."""
+    """Address on which the server listens. By default, only this machine can connect;
+    with 0.0.0.0, everybody who knows the URL can connect."""
     port: int = 8080
-    """Port of the server; the next free one if it is taken."""
+    """Port of the server. If it is taken, the next free port is used."""
     no_browser: Flag = False
-    """Do not open a browser. It is also not opened over ssh, without a display, or if
-    other machines can connect."""
+    """Do not open a browser. A browser is also not opened over ssh, without a display,
+    or if other machines can connect."""
     background: Annotated[Color | str, tyro.conf.arg(metavar="R G B|COLOR")] = (0.0, 0.0, 0.0)
-    """Background at first: red, green and blue from 0 to 1, or a colour such as white
-    or #87ceeb."""
+    """Initial background: red, green and blue from 0 to 1, or a colour such as white or
+    #87ceeb."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that is up at first; by default the one in the file, or a guess from it
-    or its cameras."""
+    """The axis that points up at first; by default the one in the file, or a guess from
+    the gaussians or the cameras."""
 
 
 def run(options: View) -> None:
@@ -86,7 +86,8 @@ def run(options: View) -> None:
     if up is None:
         up, reason = up_of(subject, cameras)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
-    # Imported early because it takes long; the site reports errors.
+    # Imported early, because the import takes long. If it fails, the site reports the
+    # error.
     with contextlib.suppress(ImportError):
         importlib.import_module("v3dg.viewer.tab")
     with _interrupts() as interrupts:
@@ -114,28 +115,30 @@ def run(options: View) -> None:
 
 
 def _check_budget(options: View, subject: Subject) -> None:
-    """Refuse a budget for an asset, which is drawn whole."""
-    expected = f"a bundle or a scene, got the asset {shown(options.subject)}; build a bundle of it"
+    """Raise UsageError for a budget with an asset, which is always drawn completely."""
+    expected = (
+        f"a bundle or a scene, got the asset {shown(options.subject)}; build a bundle from it"
+    )
     check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
 
 
 def _background_of(options: View) -> Color:
     background = color_of(options.background)
     if background is None:
-        raise UsageError("--background: expected a colour, got none")
+        raise UsageError("--background: expected a colour, got none; choose one")
     return background
 
 
 def _folder_of(subject: Path) -> Path | None:
-    """The folder of a local file."""
+    """Return the folder of a local file; None for a URL."""
     if is_url(subject):
         return None
     return subject.absolute().parent
 
 
 def _tolerance_of(options: View) -> float:
-    """Return the tolerance to begin with; UsageError or ValueError if it is not finite,
-    or the budget is wrong."""
+    """Return the initial tolerance; raise UsageError or ValueError if it is not finite,
+    or if the budget is invalid."""
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
     tolerance = options.tolerance
@@ -144,7 +147,7 @@ def _tolerance_of(options: View) -> float:
         if options.budget is None:
             tolerance = DEFAULT_TOLERANCE
     rule_of(tolerance, options.budget, 0)
-    check_usage("--tolerance", math.isfinite(tolerance), f"a number, got {tolerance}")
+    check_usage("--tolerance", math.isfinite(tolerance), f"a finite number, got {tolerance}")
     return tolerance
 
 
@@ -160,8 +163,9 @@ def _announce(options: View, site: "Site", notes: list[str]) -> None:
 
 
 def _has_browser() -> bool:
-    """Return whether to open a browser: not over ssh, where it would open on the other
-    machine, and no text browser without a display."""
+    """Return whether to open a browser. It is not opened over ssh, because it would
+    open on the wrong machine, nor without a display, because it could be a text
+    browser."""
     if "SSH_CONNECTION" in os.environ:
         return False
     has_display = any(os.environ.get(name) for name in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
@@ -169,8 +173,8 @@ def _has_browser() -> bool:
 
 
 def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
-    """Return the photographs of cameras by name, beside the file of the cameras or in a
-    folder `images` near it."""
+    """Return the paths of photographs by the names of cameras. They are searched beside
+    the file of the cameras and in folders `images` near it."""
     if cameras is None:
         return {}
     folder = cameras
@@ -180,7 +184,7 @@ def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
     places = [place / part for place in nearby for part in ("", "images")]
     photographs = {}
     for name in names:
-        # Names may lack the suffix, as in NeRF's synthetic scenes.
+        # Names may lack a suffix, as in NeRF's synthetic scenes.
         files = (place / (name + suffix) for place in places for suffix in ("", ".png", ".jpg"))
         with contextlib.suppress(StopIteration, OSError, ValueError):
             photographs[name] = next(file for file in files if file.is_file())
@@ -189,11 +193,12 @@ def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Collect the numbers of the received signals, Ctrl-C and SIGTERM, in a list.
+    """Yield a list to which the numbers of received signals (Ctrl-C and SIGTERM) are
+    appended.
 
-    Exceptions would leave threads half started. After a signal, further ones are
-    ignored, because the process ends. A handler may run while its thread holds any
-    lock, so it must not take one.
+    Signals raise no exceptions, which could interrupt the start of a thread. If a
+    signal was received, further ones are ignored at the end, because the process ends.
+    The handler must not take a lock, because its thread may already hold it.
     """
     received: list[int] = []
     numbers = (*SIGNALS, signal.SIGTERM)

@@ -1,1 +1,2 @@
-"""Replacements for functions of other packages, with the same arguments and results."""
+"""Replacements for functions of other packages, with the same arguments and results as
+the originals."""

@@ -28,7 +28,7 @@ from v3dg.rasterize import (
 if TYPE_CHECKING:
     import torch
 
-Info: TypeAlias = dict[str, Any]  # gsplat's dict has tensors and numbers
+Info: TypeAlias = dict[str, Any]  # values are tensors and numbers, as in gsplat
 
 _LOCATED = (
     "means2d",
@@ -41,20 +41,21 @@ _LOCATED = (
     "is_seen",
 )
 _FARTHEST = 1e10
-_IGNORED = {"tile_size", "channel_chunk", "segmented"}  # these only affect how gsplat computes
-# Unsupported arguments of gsplat, and what to use instead.
+# These only change how gsplat computes, not its results.
+_IGNORED = {"tile_size", "channel_chunk", "segmented"}
+# Arguments of gsplat that are not supported, with advice.
 _UNSUPPORTED = {
     "camera_model": "undistort the pictures first",
     "radial_coeffs": "undistort the pictures first",
     "tangential_coeffs": "undistort the pictures first",
     "thin_prism_coeffs": "undistort the pictures first",
     "ftheta_coeffs": "undistort the pictures first",
-    "rolling_shutter": "a camera takes all rows of a picture at once",
-    "viewmats_rs": "a camera takes all rows of a picture at once",
-    "with_ut": "gaussians are ellipses on the image",
-    "with_eval3d": "gaussians are ellipses on the image",
+    "rolling_shutter": "all rows of a picture must have the same camera; remove it",
+    "viewmats_rs": "all rows of a picture must have the same camera; remove it",
+    "with_ut": "gaussians are projected as ellipses; remove it",
+    "with_eval3d": "gaussians are projected as ellipses; remove it",
     "covars": "pass quats and scales",
-    "sparse_grad": "gradients are dense",
+    "sparse_grad": "gradients are always dense; remove it",
     "distributed": "train on one device",
 }
 
@@ -82,43 +83,44 @@ def rasterization(
     rasterize_mode: str = "classic",
     **options: object,
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
-    """Draw N gaussians for C cameras, like the function of this name in gsplat 1.5.
+    """Draw N gaussians for C cameras, like the function with this name in gsplat 1.5.
 
     The tensors must be float32 or, on the CPU, all float64.
 
     Args:
-        means: (N, 3).
-        quats: (N, 4).
-        scales: (N, 3).
-        opacities: (N,).
+        means: (N, 3) centres in world space.
+        quats: (N, 4) rotations w, x, y, z; they need not be normalised.
+        scales: (N, 3) standard deviations; not logarithms.
+        opacities: (N,) in [0, 1]; not logits.
         colors: (N, 3) or (C, N, 3) colours; with `sh_degree` (N, K, 3) or (C, N, K, 3)
             coefficients.
-        viewmats: (C, 4, 4), without gradient.
-        Ks: (C, 3, 3).
+        viewmats: (C, 4, 4) world to camera, without gradient.
+        Ks: (C, 3, 3) intrinsics in px.
         width: Width of the pictures in px.
         height: Height of the pictures in px.
-        near_plane: Gaussians nearer than this are not drawn.
-        far_plane: Gaussians farther than this are not drawn.
+        near_plane: Gaussians with a smaller depth are not drawn.
+        far_plane: Gaussians with a larger depth are not drawn.
         radius_clip: Gaussians with a radius of at most this many px are not drawn.
         eps2d: Variance of the low-pass filter in px².
         sh_degree: Degree of the coefficients in `colors`; None for colours.
-        packed: Whether the dict has only the visible pairs of camera and gaussian.
+        packed: Whether the dict contains only visible pairs of a camera and a gaussian.
         backgrounds: (C, 3) colours; black if None.
         render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", where D is depth and ED
             expected depth.
-        absgrad: Whether `means2d` gets `.absgrad`.
+        absgrad: Whether to set `.absgrad` of `means2d` to the sum of absolute
+            gradients.
         rasterize_mode: "classic", or "antialiased" to compensate opacities for the
             filter.
         options: The other arguments of gsplat. `tile_size`, `channel_chunk` and
-            `segmented` only affect how gsplat computes and are ignored. The others must
-            have a value that turns them off.
+            `segmented` only affect how gsplat computes and are ignored. All others are
+            not supported and must have a value that turns them off.
 
     Returns:
         Pictures (C, H, W, D), alphas (C, H, W, 1), and a dict: `means2d`, `depths`,
-        `conics`, `opacities` and `radii`, which are (C, N, ...) or, if `packed`, have a
-        row per visible pair, with `camera_ids` and `gaussian_ids`; `width`, `height`,
-        `n_cameras`. `means2d` receives gradients, and has `.absgrad` if `absgrad` is
-        set.
+        `conics`, `opacities` and `radii`, which are (C, N, ...) or, if `packed`, have
+        one row per visible pair; `camera_ids` and `gaussian_ids` of the pairs; `width`,
+        `height` and `n_cameras`. `means2d` receives gradients, and has `.absgrad` if
+        `absgrad` is set.
 
     Raises:
         ValueError: A shape or a value is wrong, or is not supported.
@@ -144,7 +146,8 @@ def rasterization(
 
 
 def _check_tensors(tensors: Mapping[str, torch.Tensor]) -> None:
-    """Raise TypeError unless all arguments are tensors on a device that can draw."""
+    """Raise TypeError unless all arguments are tensors; raise an error if their device
+    cannot draw them."""
     for name, value in tensors.items():
         if not hasattr(value, "requires_grad"):
             raise TypeError(f"{name}: expected a torch tensor, got {type(value).__name__}")
@@ -154,13 +157,13 @@ def _check_tensors(tensors: Mapping[str, torch.Tensor]) -> None:
 def rasterization_2dgs(*arguments: object, **options: object) -> NoReturn:
     """Raise NotImplementedError: 2D gaussians are not supported."""
     raise NotImplementedError(
-        "rasterization_2dgs: expected 3D gaussians, got 2D ones; draw them with gsplat"
+        "rasterization_2dgs: 2D gaussians are not supported; draw them with gsplat"
     )
 
 
 @dataclass
 class _Look:
-    """The arguments of a call that affect drawing, by gsplat's names."""
+    """The arguments of a call that affect drawing, with gsplat's names."""
 
     near_plane: float
     far_plane: float
@@ -178,11 +181,11 @@ class _Look:
         one_of(self.rasterize_mode, "rasterize_mode", ("classic", "antialiased"))
         self.eps2d = real(self.eps2d, "eps2d", "a variance of at least 0 px²", 0)
         if self.sh_degree is not None:
-            self.sh_degree = whole(self.sh_degree, "sh_degree", "a degree of 0 to 3", 0, 3)
+            self.sh_degree = whole(self.sh_degree, "sh_degree", "a degree from 0 to 3", 0, 3)
 
     @property
     def clips(self) -> bool:
-        """Whether gaussians may be left out because of their depth or size."""
+        """Whether gaussians may be omitted because of their depth or size."""
         return self.far_plane < _FARTHEST or self.radius_clip > 0
 
     @property
@@ -191,17 +194,18 @@ class _Look:
 
     @property
     def depth(self) -> str:
-        """ "D" for accumulated depth, "ED" for expected depth, "" for none."""
+        """The kind of depth: "D" for accumulated depth, "ED" for expected depth, or
+        ""."""
         return self.render_mode.removeprefix("RGB").lstrip("+")
 
 
 def _check_unsupported(options: dict[str, object]) -> None:
-    """Raise errors for arguments that gsplat does not have, and for values that v3dg
+    """Raise an error for arguments that gsplat does not have, and for values that v3dg
     does not support."""
     for name in options.keys() - _IGNORED:
         if name not in _UNSUPPORTED:
             raise TypeError(
-                f"{name}: expected an argument of gsplat 1.5's rasterization, got another"
+                f"{name}: expected an argument of gsplat 1.5's rasterization, got an unknown one"
             )
         value = options[name]
         if str(value) not in {"None", "False", "pinhole", "RollingShutterType.GLOBAL"}:
@@ -214,11 +218,10 @@ def _cameras(
     check(
         "viewmats",
         not viewmats.requires_grad,
-        "no gradient; cameras are not trained, call .detach()",
+        "tensors without gradient, got tensors that require it; cameras are not trained, so call "
+        ".detach()",
     )
-    check(
-        "Ks", len(Ks) == len(viewmats), f"one for each of {len(viewmats)} viewmats, got {len(Ks)}"
-    )
+    check("Ks", len(Ks) == len(viewmats), f"as many as viewmats ({len(viewmats)}), got {len(Ks)}")
     pairs = zip(viewmats.cpu().numpy(), Ks.detach().cpu().numpy(), strict=True)
     return [Camera(viewmat, K, width, height, near).core for viewmat, K in pairs]
 
@@ -226,8 +229,8 @@ def _cameras(
 def _sh_of_views(
     look: _Look, colors: torch.Tensor, num_cameras: int, means: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Return the sh (N, K, 3) for the core: one array for all cameras, or one per
-    camera."""
+    """Return the SH coefficients (N, K, 3) for the core: one array for all cameras, or
+    one array per camera."""
     count = len(means)
     if not look.has_color:
         return [means.new_zeros(count, 1, 3)]
@@ -238,7 +241,10 @@ def _sh_of_views(
         expected = (count, (look.sh_degree + 1) ** 2, 3)
         coefficients = colors[..., : expected[1], :]
     is_right = tuple(coefficients.shape) in (expected, (num_cameras, *expected))
-    shape = f"{(count, 3)}, or with sh_degree {expected} at least, or one such a camera"
+    shape = (
+        f"{(count, 3)}, or at least {expected} with sh_degree, or the same with a first dimension "
+        "for cameras"
+    )
     check("colors", is_right, f"shape {shape}, got {tuple(colors.shape)}")
     if coefficients.ndim == 3:
         return [coefficients.contiguous()]
@@ -246,7 +252,8 @@ def _sh_of_views(
 
 
 def _background_of_views(look: _Look, num_cameras: int, dtype: torch.dtype) -> list[torch.Tensor]:
-    """Return colours (3,): black for all cameras, or one colour per camera."""
+    """Return background colours (3,): black for all cameras, or one colour per
+    camera."""
     import torch
 
     if look.backgrounds is None or not look.has_color:
@@ -263,8 +270,8 @@ def _draw(
     colors: torch.Tensor,
     size: tuple[int, int],
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
-    """Return pictures, alphas and the dict of gsplat; ``shape`` is means, quats, scales
-    and opacities, ``size`` is width and height in px."""
+    """Return pictures, alphas and gsplat's dict. ``shape`` is means, quats, scales and
+    opacities; ``size`` is width and height in px."""
     *geometry, opacity = (tensor.contiguous() for tensor in shape)
     gradient = CenterGradient()
     located = _locate()(look, cameras, gradient, *geometry, opacity)
@@ -300,7 +307,7 @@ def _draw(
 def _picture(
     look: _Look, color: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None
 ) -> torch.Tensor:
-    """Return (H, W, D) the channels that the render mode requests."""
+    """Return the channels (H, W, D) of a picture that the render mode requests."""
     import torch
 
     if depth is None:
@@ -324,12 +331,12 @@ class _Context(Protocol):
 
 @functools.cache
 def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
-    """Return the operation that projects gaussians onto the images; its results are the
-    tensors of the dict.
+    """Return the operation that projects gaussians onto the images. Its results are the
+    tensors in the dict.
 
-    The gradient of a picture reaches the gaussians through the picture; `means2d` only
-    reports it to training strategies. A loss on `means2d` or `depths` would therefore
-    have no effect, and raises an error.
+    The gradient of a picture flows to the gaussians directly, not through `means2d`,
+    which only reports it to training strategies. A loss on `means2d` or `depths` would
+    therefore have no effect, so it raises an error.
     """
     import torch
 
@@ -365,7 +372,8 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
             check(
                 "means2d, depths",
                 is_all,
-                "a loss of pictures only, got one of these tensors; project the means for it",
+                "a loss on pictures only, got a loss on one of these tensors; project the means "
+                "in torch instead",
             )
             return (None,) * 7
 
@@ -380,8 +388,9 @@ def _located(
     scales: torch.Tensor,
     opacities: torch.Tensor,
 ) -> tuple[list[torch.Tensor], list[torch.Tensor | None]]:
-    """Return centres, depths, conics, opacities and radii; then, if needed, the cameras
-    and gaussians of the pairs, and which gaussians are visible."""
+    """Return centres, depths, conics, opacities and radii; then, where needed, the
+    cameras and gaussians of the visible pairs, and (C, N) whether each gaussian is
+    visible."""
     import torch
 
     unused_colors = means[:, None]

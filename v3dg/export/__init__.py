@@ -1,5 +1,5 @@
-"""Bundles and scenes for the viewers of other programs: a module a format
-(docs/formats.md)."""
+"""Exports bundles and scenes for the viewers of other programs, with one module per
+format (docs/formats.md)."""
 
 from v3dg.export._folder import check_outside
 from v3dg.export.site import SITE_NEEDS, Site, write_site

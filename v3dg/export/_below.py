@@ -1,4 +1,4 @@
-"""Files below a folder, reached by relative names without following links."""
+"""Access to files below a folder by relative names, without following links."""
 
 import errno
 import os
@@ -8,22 +8,22 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-# O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+# With O_NONBLOCK, opening a pipe does not wait for a writer. Regular files ignore it.
 _FILE = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 def folders_above(name: str) -> list[str]:
-    """Return the folders that a relative name goes through, the highest first."""
+    """Return the folders in a relative name, from the outermost to the innermost."""
     parts = name.split("/")[:-1]
     return ["/".join(parts[: count + 1]) for count in range(len(parts))]
 
 
 class Folder(AbstractContextManager["Folder"]):
-    """An open folder. All names are relative to it, with `/` between folders, and no
-    link is followed.
+    """An open folder. All names are relative to this folder and use `/` as separator.
+    No link is followed.
 
-    A folder on the way that is a link or a file is an OSError. Errors name
-    `display_path`, not the path.
+    If a folder in a name is a link or a file, OSError is raised. Errors contain
+    `display_path` instead of the real path.
     """
 
     def __init__(self, path: Path, display_path: Path) -> None:
@@ -35,8 +35,8 @@ class Folder(AbstractContextManager["Folder"]):
 
     @contextmanager
     def _folder_of(self, name: str) -> Iterator[tuple[int, str]]:
-        """Yield a descriptor of the folder that contains a file or folder, and its name
-        there."""
+        """Yield a descriptor of the folder that contains a file or folder, and the last
+        part of the name."""
         *folders, last = name.split("/")
         descriptor = os.dup(self.descriptor)
         try:
@@ -54,8 +54,8 @@ class Folder(AbstractContextManager["Folder"]):
             os.close(descriptor)
 
     def status(self, name: str) -> os.stat_result | None:
-        """Return the status of a file, a folder or a link of this name; None if there
-        is none."""
+        """Return the status of a file, a folder or a link; None if the name does not
+        exist."""
         try:
             with self._folder_of(name) as (folder, last):
                 return os.stat(last, dir_fd=folder, follow_symlinks=False)
@@ -63,8 +63,8 @@ class Folder(AbstractContextManager["Folder"]):
             return None
 
     def open_file(self, name: str) -> int:
-        """Return a descriptor to read a file; OSError for a link, ValueError for a
-        folder or a device."""
+        """Open a file for reading and return its descriptor; raise OSError for a link,
+        and ValueError for a folder or a device."""
         with self._folder_of(name) as (folder, last):
             descriptor = os.open(last, _FILE, dir_fd=folder)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -75,13 +75,13 @@ class Folder(AbstractContextManager["Folder"]):
         return descriptor
 
     def make_folder(self, name: str) -> None:
-        """Make a folder unless something has that name."""
+        """Create a folder, unless the name already exists."""
         with self._folder_of(name) as (folder, last), suppress(FileExistsError):
             os.mkdir(last, dir_fd=folder)
 
     def move(self, source: str, target: str) -> None:
-        """Rename a file, and make the folders above its new name; FileExistsError where
-        that is taken."""
+        """Rename a file, creating the folders of its new name; raise FileExistsError if
+        the new name exists."""
         for parent in folders_above(target):
             self.make_folder(parent)
         with (
@@ -98,6 +98,6 @@ class Folder(AbstractContextManager["Folder"]):
             os.unlink(last, dir_fd=folder)
 
     def remove_empty_folder(self, name: str) -> None:
-        """Remove an empty folder; do nothing if it is missing or in use."""
+        """Remove an empty folder; do nothing if it is missing or not empty."""
         with suppress(OSError), self._folder_of(name) as (folder, last):
             os.rmdir(last, dir_fd=folder)

@@ -1,4 +1,4 @@
-"""Shared code of the exports: the axis that is up, rotations, names of bundles,
+"""Code that the exports share: the up axis, rotations, names of bundles, and
 documents."""
 
 import copy
@@ -22,27 +22,30 @@ from v3dg.formats import _axes
 from v3dg.scene import Scene
 
 _MIN_OPACITY = float(np.float32(_core.min_alpha))
-"""Instances of a smaller opacity are not drawn."""
+"""Instances with a smaller opacity are not drawn."""
 
 
 class ExportWarning(UserWarning):
-    """A property of instances is left out, because a format cannot hold it."""
+    """Emitted when a property of instances is left out because the format has no place
+    for it."""
 
 
-_OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
+# Characters that names of folders may not contain.
+_OTHER_LETTERS = re.compile("[^A-Za-z0-9]")
 
-# The axes of a world of which this axis is up: y as in WebGL, z as on a globe.
+# The axes of a world by its up axis: y as in WebGL, z as on a globe.
 _WORLDS = {"y": _axes.GLTF, "z": _axes.Z_UP}
 
 
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
-    """Return the (3, 3) rotation that turns the axis that is up to another axis."""
+    """Return the (3, 3) rotation that turns the up axis of a world to the up axis of a
+    format."""
     return _axes.turn(_axes.axes_of_up(up), _WORLDS[frame])
 
 
 def exported(scene: Scene, format_name: str) -> Scene:
-    """Return the instances of a scene that are drawn, for a format without opacity and
-    tint; warn if any has one."""
+    """Return the instances of a scene that are visible, for a format without opacity
+    and tint. Emit a warning if any instance has one of these."""
     if scene.factors is None:
         return scene
     visible = copy.copy(scene)
@@ -51,8 +54,8 @@ def exported(scene: Scene, format_name: str) -> Scene:
     if factors is not None:
         count = int((factors != 1).any(axis=1).sum())
         warnings.warn(
-            f"{format_name} cannot hold the opacity and tint of instances; those of {count:,} are "
-            "left out",
+            f"{format_name} cannot store the opacity and tint of instances; those of {count:,} "
+            "instances are left out",
             ExportWarning,
             stacklevel=3,
         )
@@ -60,15 +63,15 @@ def exported(scene: Scene, format_name: str) -> Scene:
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:
-    """Return a folder name for each bundle, made from the name of its file; no reserved
-    name is used."""
+    """Return a folder name for each bundle, derived from the name of its file. Reserved
+    names are not used."""
     stems = [beside(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
     return distinct([_OTHER_LETTERS.sub("_", stem) for stem in stems], reserved)
 
 
 def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
-    """Return the names, with a number added to each that is reserved or repeats an
-    earlier one in upper or lower case."""
+    """Return distinct names: a number is appended to each name that is reserved or
+    equals an earlier one, ignoring case."""
     results: list[str] = []
     used = {name.casefold() for name in reserved}
     for number, name in enumerate(names):
@@ -82,17 +85,17 @@ def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
 
 
 def rows_by(numbers: NDArray[np.int32] | NDArray[np.int64], count: int) -> list[NDArray[np.intp]]:
-    """Return for each number from 0 to `count` - 1 the rows that have it, in ascending
-    order."""
+    """Return, for each number from 0 to `count` - 1, the ascending indices of the rows
+    with that number."""
     order = np.argsort(numbers, kind="stable")
     return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
 
 
 def detail_of(bundle: Bundle) -> dict[str, float]:
-    """Return from which distances levels are fine enough: for level 1 it is `reach`
-    times the focal length in px, divided by √tolerance.
+    """Return the distances at which levels become fine enough. For level 1, the
+    distance is `reach` times the focal length in px, divided by √tolerance.
 
-    Each further level is enough from `ratio` times the distance of the one before it.
+    For each further level, the distance is `ratio` times that of the level before.
     """
     groups = bundle.groups
     radius = groups.ball[:, 3].astype(np.float64) * np.sqrt(
@@ -104,16 +107,18 @@ def detail_of(bundle: Bundle) -> dict[str, float]:
     if not reach:
         return {"reach": 0.0, "ratio": math.sqrt(2)}
     ratio = (reach[-1] / reach[0]) ** (1 / max(1, len(reach) - 1))
-    return {"reach": reach[0], "ratio": max(ratio, 1.2)}  # the engine takes no less
+    # The viewer's engine accepts no smaller ratio.
+    return {"reach": reach[0], "ratio": max(ratio, 1.2)}
 
 
 def write_document(path: Path, document: Mapping[str, object]) -> None:
-    """JSON without spaces, into a folder that is not in its place yet."""
+    """Write JSON without spaces. The file need not be replaced atomically, because its
+    folder is moved into place later."""
     path.write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
 
 
 def write_page(folder: Path, name: str) -> None:
-    """Write the page of an export, a copy of the package's file of that name."""
+    """Write the page of an export: a copy of the package's file with this name."""
     (folder / "index.html").write_bytes(files("v3dg.export").joinpath(name).read_bytes())
 
 

@@ -1,11 +1,10 @@
-"""The folder of an export: files of an earlier export are replaced, and nothing else is
-changed.
+"""Replaces the files of an earlier export in a folder, and changes nothing else there.
 
-New files are written to `new` in a hidden folder inside, so that all moves stay within
-one file system. Once they are complete, their record is written beside `new`, the files
-that they replace move to `old`, and they move into place; moving the record completes
-the export. Until then everything can be moved back: after an error at once, and after a
-kill when the next export begins.
+New files are written to `new` in a hidden subfolder, so that all moves stay within one
+file system. When they are complete, their record is written beside `new`. Then the
+files that they replace are moved to `old`, and the new files are moved into place.
+Moving the record completes the export. Until then, everything can be moved back: at
+once after an error, or when the next export begins if the process was killed.
 """
 
 import contextlib
@@ -39,12 +38,12 @@ _HIDDEN = re.compile(r"\.v3dg-export\.[0-9a-f]{16}\.tmp")
 
 @dataclass(frozen=True)
 class NewFiles:
-    """The place of the files of a new export.
+    """The folder for the files of a new export.
 
     Attributes:
-        path: A folder for the new files, which take their place at the end.
-        earlier: Files of an earlier export that are as they were written; all others
-            stay.
+        path: A folder for the new files, which are moved into place at the end.
+        earlier: Names of files of an earlier export that are unchanged. These are
+            replaced or removed at the end; all other files stay.
     """
 
     path: Path
@@ -52,7 +51,7 @@ class NewFiles:
 
 
 def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None]) -> None:
-    """Refuse, with ValueError, to write to a folder that contains an input."""
+    """Raise ValueError if a folder contains an input of the export."""
     if not folder.is_dir():
         return
     status = folder.stat()
@@ -62,7 +61,7 @@ def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None])
         parents = [parent for parent in Path(os.path.realpath(path)).parents if parent.exists()]
         if any(os.path.samestat(parent.stat(), status) for parent in parents):
             raise ValueError(
-                f"{folder}: the input {os.fspath(path)} is in it; choose another folder"
+                f"{folder}: contains the input {os.fspath(path)}; choose another folder"
             )
 
 
@@ -70,19 +69,19 @@ def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None])
 def replacing_export(
     folder: Path, scene: Scene, certain: Iterable[str] = (), *, overwrite: bool = False
 ) -> Iterator[NewFiles]:
-    """Give a folder to fill; at the end its files take the place of those of an earlier
-    export.
+    """Yield a folder for the new files. At the end, they replace the files of an
+    earlier export.
 
-    The folder itself stays, with its permissions. After an error, its content is as
-    before; a folder that did not exist is removed again.
+    The folder itself is kept, with its permissions. After an error, its content is as
+    before, and a folder that did not exist is removed again.
 
     Args:
         folder: The folder to write; a link to a folder stays a link.
         scene: The exported scene, whose files must not be in the folder.
-        certain: Names of files that will be written, so that it is known at once
-            whether they may.
-        overwrite: Whether files of the same names may be replaced that are not of an
-            earlier export. All others stay in any case.
+        certain: Names of files that will be written in any case; whether they may be
+            replaced is checked at once.
+        overwrite: Whether files with the same names may be replaced even if they are
+            not from an earlier export. All other files stay in any case.
 
     Raises:
         ValueError: An input is in the folder, ``folder`` is not a folder, a file must
@@ -91,7 +90,11 @@ def replacing_export(
         OSError: A file cannot be written.
     """
     is_free = folder.is_dir() or not os.path.lexists(os.path.realpath(folder))
-    check(folder, is_free, "a new folder, or one with an earlier export, got a file")
+    check(
+        folder,
+        is_free,
+        "a new folder or one with an earlier export, got a file; choose another name",
+    )
     check_outside(folder, (bundle.path for bundle in scene.bundles))
     with _made(folder) as target, _naming_errors(folder, target), Folder(target, folder) as root:
         lock(root.descriptor, folder, "export")
@@ -108,9 +111,10 @@ def replacing_export(
 
 
 def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
-    """Bring back what an export moved that did not end, and remove its hidden folder,
-    which is its alone."""
-    with contextlib.suppress(OSError, ValueError):  # the first error is reported
+    """Move back the files of an export that did not finish, and remove its hidden
+    folder."""
+    # The error of the export itself is reported.
+    with contextlib.suppress(OSError, ValueError):
         if _restore(root, hidden, folder):
             _remove_unused_folders(root, hidden, folder)
             try:
@@ -122,24 +126,25 @@ def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
 
 @contextlib.contextmanager
 def _made(folder: Path) -> Iterator[Path]:
-    """Make the folder and those above it, and yield its path without links. After an
-    error, those that were made are removed if they are empty."""
+    """Create a folder and the folders above it, and yield its path without links. After
+    an error, remove the created folders if they are empty."""
     target = Path(os.path.realpath(folder))
-    missing = [path for path in (target, *target.parents) if not path.exists()]  # the lowest first
+    # From the innermost outwards.
+    missing = [path for path in (target, *target.parents) if not path.exists()]
     try:
         target.mkdir(parents=True, exist_ok=True)
         yield target
     except BaseException:
         for path in missing:
-            with contextlib.suppress(OSError):  # somebody else has put something there
+            # Not empty: another program has written to the folder.
+            with contextlib.suppress(OSError):
                 path.rmdir()
         raise
 
 
 @contextlib.contextmanager
 def _naming_errors(folder: Path, target: Path) -> Iterator[None]:
-    """Have the system's errors name files as they will be called, outside of the hidden
-    folder."""
+    """Replace paths in the hidden folder by their final paths in system errors."""
     try:
         yield
     except OSError as error:
@@ -159,7 +164,7 @@ def _naming_errors(folder: Path, target: Path) -> Iterator[None]:
 
 
 class _Place:
-    """A folder that an export is written to, and what an earlier one wrote there."""
+    """The folder of an export, with the record of an earlier export in it."""
 
     def __init__(self, folder: Path, target: Path, root: Folder, *, overwrite: bool) -> None:
         self._folder = folder
@@ -172,11 +177,10 @@ class _Place:
         record = read_record(root, RECORD, folder / RECORD)
         is_empty = not set(os.listdir(root.descriptor)) - set(unfinished)
         advice = (
-            "choose another, or overwrite, which replaces files of the same names and removes none"
+            "choose another folder, or overwrite, which replaces files with the same names and "
+            "removes none"
         )
-        expected = (
-            f"a new folder, or one with an earlier export, got one without {RECORD}; {advice}"
-        )
+        expected = f"a new folder or one with an earlier export, got one without {RECORD}; {advice}"
         check(folder, overwrite or is_empty or record is not None, expected)
         self._record = record or Record({}, [])
         self.earlier: dict[str, Stamp] = self._record.unchanged(root)
@@ -184,8 +188,8 @@ class _Place:
             self.earlier[RECORD] = _stamp(root, RECORD)
 
     def check(self, names: Iterable[str]) -> None:
-        """Refuse, with ValueError, to write files of these names where something has
-        them that may not go."""
+        """Raise ValueError if files with these names would replace anything that must
+        not be replaced."""
         for name in names:
             for parent in folders_above(name):
                 status = self._root.status(parent)
@@ -198,14 +202,14 @@ class _Place:
             expected = "a file, got a folder, a link or a device, which an export does not replace"
             check(self._folder / name, is_file(status), f"{expected}; move it elsewhere")
             expected = (
-                "a file of an earlier export, got one that was changed, or that no export wrote"
+                "a file of an earlier export, got one that was changed or not written by an export"
             )
             advice = "move it elsewhere, or overwrite"
             check(self._folder / name, self._overwrite, f"{expected}; {advice}")
 
     def put(self, record: Record, path: Path) -> None:
-        """Have the new files take the place of the earlier ones; `path` is for the new
-        record until then."""
+        """Replace the files of the earlier export by the new files. `path` is where the
+        new record is written first."""
         root = self._root
         hidden = self.hidden
         self.check([*record.files, RECORD])
@@ -233,10 +237,10 @@ def _stamp(root: Folder, name: str) -> Stamp:
 
 
 def _restore(root: Folder, hidden: str, folder: Path) -> bool:
-    """Bring all back that was moved for an export that did not end; returns whether all
-    is in its place."""
+    """Move back all files that an unfinished export has moved; return whether all files
+    are in place again."""
     record = read_record(root, f"{hidden}/{RECORD}", folder / hidden / RECORD)
-    if record is None:  # it had not begun to move anything, or has ended
+    if record is None:  # the export had not moved anything yet, or it had finished
         return True
     earlier = read_record(root, f"{hidden}/old/{RECORD}", folder / hidden / "old" / RECORD)
     earlier = earlier or read_record(root, RECORD, folder / RECORD) or Record({}, [])
@@ -249,7 +253,7 @@ def _restore(root: Folder, hidden: str, folder: Path) -> bool:
         if root.status(f"{hidden}/old/{name}") is not None:
             try:
                 root.move(f"{hidden}/old/{name}", name)
-            except OSError:  # somebody else has put something there
+            except OSError:  # another program has written a file with this name
                 is_whole = False
     for name in reversed(record.folders):
         if name not in earlier.folders:
@@ -258,8 +262,8 @@ def _restore(root: Folder, hidden: str, folder: Path) -> bool:
 
 
 def _remove_unused_folders(root: Folder, hidden: str, folder: Path) -> None:
-    """Remove what an earlier export made, if it is empty and the one that replaced it
-    does not use it."""
+    """Remove the folders that an earlier export created, if they are empty and the new
+    export does not use them."""
     earlier = read_record(root, f"{hidden}/old/{RECORD}", folder / hidden / "old" / RECORD)
     later = read_record(root, RECORD, folder / RECORD)
     if earlier is not None and later is not None:
@@ -268,17 +272,17 @@ def _remove_unused_folders(root: Folder, hidden: str, folder: Path) -> None:
 
 
 def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
-    """After an export that was killed: bring back what it moved, and remove what
-    records say that it wrote.
+    """Clean up after an export that was killed: move back the files that it moved, and
+    remove the files that records list.
 
-    Files that it wrote before its record stay.
+    Files that were written before the record stay.
     """
     with contextlib.suppress(OSError, ValueError):
         if not _restore(root, hidden, folder):
             return
         _remove_unused_folders(root, hidden, folder)
-        # It went back and has a record, or it ended, and that of the earlier one is
-        # left.
+        # The record in the hidden folder is that of the killed export if it was undone,
+        # or else that of the earlier export.
         present = read_record(root, RECORD, folder / RECORD)
         folders: set[str] = set()
         if present is not None:

@@ -1,8 +1,9 @@
-"""The record of an export: which files and folders it wrote, and what was in the files.
+"""The record of an export: the files and folders that it wrote, with the hashes of the
+files.
 
-It lies in the folder of the export, so anybody may have written it: only names that an
-export can have, all of them below the folder, are taken from it, and only files with
-the size and the hash that it gives are ours.
+The record is in the folder of the export, so any program may have changed it.
+Therefore, only names that an export can write are accepted, all of which are below the
+folder; and a file counts as written by an export only if its size and its hash match.
 """
 
 import hashlib
@@ -23,7 +24,7 @@ from v3dg.export._below import Folder
 RECORD = "v3dg-export.json"
 _FORMAT = "v3dg-export"
 _VERSION = 1
-_MOST_BYTES = 64 << 20  # size of a record of a million files
+_MOST_BYTES = 64 << 20  # bytes; the size of a record of a million files
 _PIECE_BYTES = 1 << 20
 _HASH_BYTES = 16
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9_]{1,100}(/[A-Za-z0-9_]{1,100})?")
@@ -34,8 +35,8 @@ _HASH = re.compile(f"[0-9a-f]{{{2 * _HASH_BYTES}}}")
 
 
 class Stamp(NamedTuple):
-    """The identity of a file: another file, or one that was written to, has another
-    stamp."""
+    """The identity of a file. A different file, or a file that was written to, has a
+    different stamp."""
 
     inode: int
     num_bytes: int
@@ -45,7 +46,7 @@ class Stamp(NamedTuple):
 
 @dataclass(frozen=True)
 class Content:
-    """The size and the hash of a written file."""
+    """The size and the hash of a file."""
 
     num_bytes: int
     digest: str
@@ -53,18 +54,19 @@ class Content:
 
 @dataclass(frozen=True)
 class Record:
-    """Files by their names relative to the folder, and the folders that were made for
-    them."""
+    """The files of an export, by names relative to its folder, and the folders that
+    were created for them."""
 
     files: dict[str, Content]
     folders: list[str]
 
     @classmethod
     def of_files_below(cls, path: Path) -> "Record":
-        """Return the record of all files, without folders, below a folder to which
-        nobody else writes.
+        """Return the record of all files below a folder to which no other program
+        writes; without folders.
 
-        Files that others refer to come last.
+        Files are sorted so that those in subfolders come first, because the others
+        refer to them.
         """
         names = [file.relative_to(path).as_posix() for file in path.rglob("*") if not file.is_dir()]
         assert all(_FILE_NAME.fullmatch(name) and name != RECORD for name in names), names
@@ -77,8 +79,8 @@ class Record:
         return json.dumps(document, separators=(",", ":")).encode("ascii")
 
     def unchanged(self, root: Folder, prefix: str = "") -> dict[str, Stamp]:
-        """Return the files below `prefix` whose content is unchanged since they were
-        written."""
+        """Return the stamps of the files below `prefix` whose content is still the
+        recorded one."""
         stamps: dict[str, Stamp] = {}
         for name, content in self.files.items():
             stamp = stamp_of_content(root, f"{prefix}{name}", content)
@@ -88,16 +90,16 @@ class Record:
 
 
 def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
-    """Read a record; None where there is none.
+    """Read a record; return None if it does not exist.
 
     Args:
-        root: The folder that the record is below.
+        root: The folder of the export.
         name: The name of the record, relative to `root`.
-        display_path: The path that errors begin with.
+        display_path: The path of the record in error messages.
 
     Raises:
-        ValueError: The file is not a record, or names a file that no export writes.
-        OSError: It cannot be read.
+        ValueError: The file is not a record, or contains a name that no export writes.
+        OSError: The record cannot be read.
     """
     status = root.status(name)
     if status is None:
@@ -115,12 +117,13 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
         document = Node(parse_json(text), str(display_path), "")
     except ValueError as error:
         raise ValueError(
-            f"{display_path}: expected the record of an export, could not read it ({error})"
+            f"{display_path}: expected the record of an export, got an unreadable file ({error}); "
+            "remove it"
         ) from None
     fields = document.fields(("format", "version", "folders", "files"))
     if fields["format"].value != _FORMAT or fields["version"].value != _VERSION:
         raise document.problem(
-            f"expected {_FORMAT} version {_VERSION}, got another; remove it to start again"
+            f"expected {_FORMAT} version {_VERSION}, got another format or version; remove the file"
         )
     folders = [_checked_name(node, _FOLDER_NAME) for node in fields["folders"].items()]
     files: dict[str, Content] = {}
@@ -130,21 +133,21 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
 
 
 def _checked_name(node: Node, pattern: re.Pattern[str]) -> str:
-    """Return a name that an export can have written; ValueError for others, which may
-    lead out of the folder or to files of others."""
+    """Return a name that an export can write; raise ValueError for any other name,
+    which could be outside the folder or belong to another program."""
     name = node.value
     if not isinstance(name, str) or not pattern.fullmatch(name) or name == RECORD:
         raise node.error(
-            "a name that an export writes, below its folder", "remove the record to start again"
+            "the name of a file that an export writes", "remove the record to start again"
         )
     return name
 
 
 def _content_of_node(node: Node) -> Content:
-    size, digest = node.items("the bytes of a file and their hash", 2, 2)
+    size, digest = node.items("the size of a file in bytes and its hash", 2, 2)
     is_size = isinstance(size.value, int) and not isinstance(size.value, bool) and size.value >= 0
     if not is_size:
-        raise size.error("a whole number, 0 or more")
+        raise size.error("an integer of at least 0")
     if not (isinstance(digest.value, str) and _HASH.fullmatch(digest.value)):
         raise digest.error(f"a hash of {2 * _HASH_BYTES} hexadecimal digits")
     return Content(size.value, digest.value)
@@ -169,7 +172,7 @@ def stamp_of_status(status: os.stat_result) -> Stamp:
 
 
 def is_file(status: os.stat_result) -> bool:
-    """Return whether a status is that of a regular file, and not that of a link."""
+    """Return whether a status is that of a regular file; links are not."""
     return stat.S_ISREG(status.st_mode)
 
 
@@ -179,7 +182,7 @@ def _content_of_path(path: Path) -> Content:
 
 
 def _digest_of(file: io.FileIO) -> str:
-    """Return the hash of all that is left to read."""
+    """Return the hash of the remaining content of a file."""
     state = hashlib.blake2b(digest_size=_HASH_BYTES)
     while piece := file.read(_PIECE_BYTES):
         state.update(piece)
@@ -187,7 +190,7 @@ def _digest_of(file: io.FileIO) -> str:
 
 
 def folders_of(names: Iterable[str]) -> list[str]:
-    """Return the folders that files are in, the highest first."""
+    """Return the folders that contain files with these names, the outermost first."""
     return sorted(
         {name[:end] for name in names for end, letter in enumerate(name) if letter == "/"}
     )

@@ -1,5 +1,5 @@
-"""Errors of the coarser levels of chunks against the finest, measured in pictures:
-`errors` of streamed SOG."""
+"""Measures in pictures how much the coarser levels of chunks differ from the finest:
+the `errors` of streamed SOG."""
 
 from collections import defaultdict
 from typing import NamedTuple
@@ -13,9 +13,10 @@ from v3dg.gaussians import Gaussians
 from v3dg.rasterize import rasterize
 
 _SIDE_PX = 64
-_FOV = 0.3  # narrow, so that all of a chunk is about as large
+# Radians; narrow, so that all parts of a chunk appear at about the same scale.
+_FOV = 0.3
 _DIRECTIONS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-_FILTER_PX2 = 0.3  # the filter of viewers of the format
+_FILTER_PX2 = 0.3  # px²; the filter that viewers of this format use
 
 
 class _Finest(NamedTuple):
@@ -26,14 +27,15 @@ class _Finest(NamedTuple):
 
 
 class ChunkErrors:
-    """Errors of chunks whose levels are added from the finest on.
+    """Collects the errors of the levels of chunks, which are added from the finest to
+    the coarsest.
 
-    An error is the mean of the squared differences of colour and alpha from the
-    pictures of the finest level, from four sides. It never falls from a level to the
-    next. Of each chunk 128 KiB of pictures are kept.
+    An error is the mean squared difference of colour and alpha from pictures of the
+    finest level, which are taken from four sides. Errors never decrease from a level to
+    the next coarser one. 128 KiB of pictures are kept for each chunk.
 
     Attributes:
-        of_chunk: The errors by chunk, a number for each level.
+        of_chunk: For each chunk, the errors of its levels.
     """
 
     def __init__(self) -> None:
@@ -41,7 +43,7 @@ class ChunkErrors:
         self._finest: dict[int, _Finest] = {}
 
     def add(self, chunk: int, gaussians: Gaussians) -> None:
-        """Add the next level of a chunk, which need not have gaussians."""
+        """Add the next coarser level of a chunk, which may be empty."""
         errors = self.of_chunk[chunk]
         error = 0.0
         if len(gaussians) and chunk not in self._finest:
@@ -58,7 +60,7 @@ class ChunkErrors:
 
 
 def _cameras_around(gaussians: Gaussians) -> list[Camera]:
-    """Return cameras on four sides that show most of the gaussians."""
+    """Return cameras on four sides of the gaussians that show most of them."""
     centre, radius = ball_of_most(gaussians.means.astype(np.float64))
     distance = max(radius, 1e-6) / np.sin(_FOV / 2)
     return [

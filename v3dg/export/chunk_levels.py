@@ -1,9 +1,10 @@
-"""The levels of chunks above the level at which each of them is a single group.
+"""Makes the coarser levels of chunks, above the level at which each chunk is a single
+group.
 
-A bundle goes on with groups of several chunks. A viewer chooses the level of each chunk
-by itself, so a share of such a group would leave gaps beside a neighbour of another
-level, or be empty. Every chunk is therefore halved alone, down to one gaussian: any
-choice of levels is a cut.
+Further levels of a bundle have groups that span several chunks. Viewers choose the
+level of each chunk independently, so a part of such a group could be empty, or leave
+gaps beside a neighbour at another level. Therefore, each chunk is halved separately,
+down to one gaussian. Then any choice of levels is a cut.
 """
 
 import itertools
@@ -21,40 +22,43 @@ from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.plan import Offsets
 
-# With a small budget viewers draw levels larger than the native size of a bundle's.
-# Fits at four times the area are up to 1 dB better there, and no worse at that size.
+# With a small budget, viewers draw levels larger than the native size of a bundle's
+# levels. Fits at four times the area are up to 1 dB better there, and no worse at the
+# native size.
 _PX2_PER_GAUSSIAN = 8.0
-_STEPS = 150  # four times as many gain nothing
-_LEVEL = 9  # the level of a bundle whose targets have the most samples
-# Chunks whose levels are fitted together. Ctrl-C is handled between the fits, too.
+_STEPS = 150  # four times as many do not improve the result
+_LEVEL = 9  # a level of a bundle whose targets have the most samples
+# Number of chunks whose levels are fitted together. Ctrl-C is handled between these
+# fits.
 _CHUNKS_AT_ONCE = 256
 
 
 class LevelFilter(NamedTuple):
-    """The low-pass with which a level is drawn: see `v3dg.bundle.tables`."""
+    """The filter with which a level is drawn; see `v3dg.bundle.tables`."""
 
     px2: float
     is_compensated: bool
 
 
 def num_halvings(num_gaussians: int) -> int:
-    """Return the number of halvings down to one gaussian."""
+    """Return the number of halvings that reduce this many gaussians to one."""
     return max(0, num_gaussians - 1).bit_length()
 
 
 def halved_levels(chunks: Sequence[Gaussians], drawn: LevelFilter) -> list[list[Gaussians]]:
-    """Make the levels above those that chunks have, each of half as many gaussians,
-    down to one gaussian in every chunk.
+    """Make further levels of chunks, each with half as many gaussians, down to one
+    gaussian per chunk.
 
-    They are fitted to the chunks as `drawn`, with the filter of a bundle's levels.
+    The levels are drawn with the filter of a bundle's levels, and fitted to the chunks
+    drawn with the filter `drawn`.
 
     Args:
         chunks: The gaussians of C chunks at their coarsest level, at least one each.
-        drawn: The filter of that level.
+        drawn: The filter with which the chunks themselves are drawn.
 
     Returns:
-        Levels, each a list of C chunks. A chunk of one gaussian has it in all further
-        levels.
+        Levels, each a list of C chunks. A chunk that is reduced to one gaussian keeps
+        it in all further levels.
     """
     num_levels = num_halvings(max(map(len, chunks), default=0))
     levels: list[list[Gaussians]] = [[] for _ in range(num_levels)]
@@ -68,7 +72,7 @@ def halved_levels(chunks: Sequence[Gaussians], drawn: LevelFilter) -> list[list[
 def _halved(
     chunks: Sequence[Gaussians], num_levels: int, drawn: LevelFilter, first_chunk: int
 ) -> list[list[Gaussians]]:
-    """Return `num_levels` further levels above those of some chunks."""
+    """Return `num_levels` further levels of some chunks."""
     if num_levels == 0:
         return []
     finest = Gaussians.concatenate(chunks)
@@ -101,7 +105,8 @@ def _fit(
     drawn: LevelFilter,
     first_chunk: int,
 ) -> None:
-    """Fit all levels of all chunks, which follow each other, in place."""
+    """Fit all levels of all chunks in place; `ends` are the boundaries of their
+    gaussians."""
     num_chunks = len(finest_offset) - 1
     num_levels = (len(ends) - 1) // num_chunks
     config = BuildConfig(px2_per_gaussian=_PX2_PER_GAUSSIAN, steps=_STEPS)
@@ -114,7 +119,7 @@ def _fit(
             fit_config(config, seed=0, level=_LEVEL),
             _core.FitTarget(finest.rows, drawn.px2, drawn.is_compensated),
             np.tile(_ranges(finest_offset), (num_levels, 1)),
-            gaussians.rows,  # the fit replaces them by its result
+            gaussians.rows,  # the fit overwrites these arrays with its result
             _ranges(ends),
             np.tile(ball, (num_levels, 1)),
             ((level << 40) + chunk).ravel(),
@@ -126,5 +131,5 @@ def _fit(
 
 
 def _ranges(offset: Offsets) -> Offsets:
-    """Return (N, 2) the first element and the end of each of N parts."""
+    """Return (N, 2) the start and the end of each of N parts."""
     return np.stack([offset[:-1], offset[1:]], axis=1)

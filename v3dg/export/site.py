@@ -1,8 +1,8 @@
-"""A scene as a web page: every bundle once as streamed SOG, instances, cameras, and a
-page that draws them.
+"""Exports a scene as a web page: each bundle as streamed SOG, the instances, cameras,
+and a page that draws them.
 
-The page needs nothing but a static server and PlayCanvas's engine, one file of its npm
-package.
+The page only needs a static web server and PlayCanvas's engine, which is one file of
+its npm package.
 """
 
 import math
@@ -32,24 +32,24 @@ from v3dg.upright import direction_of, up_of
 
 SITE = "site.json"
 ENGINE = "playcanvas.min.mjs"
-# Width over height of windows for which first views are framed.
+# Aspect ratios of windows for which first views are computed.
 _START_ASPECTS = (0.4, 0.5, 0.6, 0.75, 1.0, 4 / 3, 16 / 9, 2.4)
 SITE_NEEDS = "npm install playcanvas@2.23.3", f"cp node_modules/playcanvas/build/{ENGINE} {{}}/"
-"""Commands that bring PlayCanvas's engine, in the version that the page is tested with,
-to a folder."""
+"""Commands that put PlayCanvas's engine into a folder, in the version with which the
+page is tested."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """An export that was written.
+    """A finished export.
 
     Attributes:
-        bundles: Bundles, each of them once.
-        instances: Instances of them.
-        gaussians: Number of gaussians of the finest level, of all instances.
-        coarsest: Number of gaussians of the coarsest level, of all instances, which is
-            the least that a viewer can draw.
-        bytes: Size of all files that were written.
+        bundles: Number of distinct bundles.
+        instances: Number of instances.
+        gaussians: Number of gaussians in the finest level of all instances together.
+        coarsest: Number of gaussians in the coarsest level of all instances together:
+            the fewest that a viewer can draw.
+        bytes: Total size of the written files.
         has_engine: Whether PlayCanvas's engine is beside the page.
     """
 
@@ -71,29 +71,31 @@ def write_site(
     progress: Progress = False,
     overwrite: bool = False,
 ) -> Site:
-    """Write a scene or a bundle as a web page, replacing the files of an earlier export
-    once all is written.
+    """Write a scene or a bundle as a web page. The files of an earlier export are
+    replaced when all new files are complete.
 
-    The levels of a bundle alone are in the folder itself, those of a scene's bundles in
-    folders of their own. Opacity and tint of instances are left out with a warning.
-    PlayCanvas's engine is that of the folder, or taken from `node_modules` here or
-    above.
+    The levels of a single bundle are written to the folder itself, and those of a
+    scene's bundles to one subfolder each. Opacity and tint of instances are left out
+    with a warning. If PlayCanvas's engine is not in the folder yet, it is copied from
+    `node_modules` in the working directory or above.
 
     Args:
-        subject: A scene or a bundle, or its file; the file of a scene may also have
-            cameras.
-        folder: The folder to write; it may be new, empty, or have an earlier export.
+        subject: A scene or a bundle, or the path of its file. The file of a scene may
+            also contain cameras.
+        folder: The folder to write. It may be new, empty, or contain an earlier export.
             Missing parent folders are created. `v3dg-export.json` in it lists the
             written files, and only those are replaced or removed by a later export.
-        cameras: Views that the page offers, by name; it begins with the first.
+        cameras: Cameras that the page offers, by name. The page starts with the first
+            one.
         chunk: See `write_streamed_sog`.
-        up: The axis that is up in the world; None uses the one of `v3dg.upright.up_of`.
+        up: The axis that points up in the world; None uses the axis of
+            `v3dg.upright.up_of`.
         progress: See `v3dg.build_bundle`.
         overwrite: See `write_streamed_sog`.
 
     Raises:
         TypeError: `cameras` is not a mapping from names to cameras.
-        ValueError: See `write_streamed_sog`; or the scene has no instances.
+        ValueError: The scene has no instances; or see `write_streamed_sog`.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
@@ -104,12 +106,12 @@ def write_site(
         cameras = cameras or file_cameras
     cameras = cameras or {}
     check_cameras(cameras)
-    scene = Scene.of(cast(Scene | Bundle, content))  # refuses anything else
+    scene = Scene.of(cast(Scene | Bundle, content))  # rejects anything else
     scene = _common.exported(scene, "the web page")
     is_scene = isinstance(content, Scene)
     axes = _axes(up or up_of(cast(Subject, content), cameras)[0], is_scene=is_scene)
     turn = turn_upright(axes.asset)
-    check("scene", len(scene), "instances to export, got none")
+    check("scene", len(scene), "at least one instance to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
     names = ["."]
     certain = [SITE, "index.html", INDEX, SETTINGS]
@@ -129,16 +131,16 @@ def write_site(
 
 
 class _Axes(NamedTuple):
-    """The axes that are up."""
+    """The axes that point up."""
 
-    asset: Axis  # up in the assets, which are turned so that it is -y
-    files: Axis  # up in the world, after that turn
+    asset: Axis  # up in the asset, which is rotated so that this axis becomes -y
+    files: Axis  # up in the world of the written files, after that rotation
     cameras: Axis
 
 
 def _axes(up: Axis, *, is_scene: bool) -> _Axes:
-    """Return the axes of the files: a single bundle is turned so that the axis that
-    viewers expect is up; bundles of a scene stay as its instances place them."""
+    """Return the up axes. A single bundle is rotated to the up axis that viewers
+    expect. The bundles of a scene are not rotated, because its instances place them."""
     if is_scene:
         return _Axes(asset="-y", files=up, cameras=up)
     return _Axes(asset=up, files="-y", cameras=up)
@@ -147,8 +149,8 @@ def _axes(up: Axis, *, is_scene: bool) -> _Axes:
 def _write_bundles(
     plans: list[Plan], names: list[str], folder: Path, turn: Floats, progress: Progress
 ) -> list[Export]:
-    """Write the levels of each bundle to the folder of its name, which is made unless
-    it is `.`."""
+    """Write the levels of each bundle to the folder with its name, which is created
+    unless it is `.`."""
     levels: list[Export] = []
     with Bar(sum(plan.num_gaussians for plan in plans), "export", progress) as bar:
         for name, plan in zip(names, plans, strict=True):
@@ -160,12 +162,12 @@ def _write_bundles(
 def _document(
     scene: Scene, bundles: list[dict[str, object]], axes: _Axes, cameras: Mapping[str, Camera]
 ) -> dict[str, object]:
-    """Return the document that the page reads first."""
+    """Return the document that the page loads first."""
     return {
         "version": 1,
         "tolerance": DEFAULT_TOLERANCE,
-        # Rotations by columns, from the world of the files and of the cameras to one
-        # with y up.
+        # Rotations, column by column, from the worlds of the files and of the cameras
+        # to a world with y up.
         "rotation": _common.rotation_to(axes.files, "y").T.tolist(),
         "camera_rotation": _common.rotation_to(axes.cameras, "y").T.tolist(),
         "bundles": bundles,
@@ -176,7 +178,7 @@ def _document(
 
 
 def _start_views(scene: Scene, up: Axis) -> list[dict[str, object]]:
-    """Return the first views of a page without cameras, for windows from narrow to
+    """Return the first views for a page without cameras, for windows from narrow to
     wide."""
     framing = frame_subject(scene)
     views = []
@@ -197,7 +199,7 @@ def _bundle(name: str, plan: Plan, levels: Export) -> dict[str, object]:
 
 
 def _reach_of_half(bundle: Bundle) -> float:
-    """Return the `reach` of `detail_of` for the level to which a chunk of all gaussians
+    """Return the `reach` of `detail_of` for a bundle of one level, whose single chunk
     is halved."""
     corners = bundle.clusters.box[np.diff(bundle.clusters.offset) > 0].reshape(-1, 3)
     radius = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
@@ -205,7 +207,8 @@ def _reach_of_half(bundle: Bundle) -> float:
 
 
 def _instances(scene: Scene) -> dict[str, list[int] | list[float]]:
-    """Return the columns of the instances, with a few more digits than float32 has."""
+    """Return the columns of the instances, with nine significant digits: float32 needs
+    no more."""
     columns: dict[str, list[int] | list[float]] = {"bundle": scene.instance_bundle.tolist()}
     for name in ("positions", "quaternions", "scales", "importance"):
         values = getattr(scene, name).ravel().tolist()
@@ -224,11 +227,11 @@ def _camera(name: str, camera: Camera) -> dict[str, object]:
 
 
 def _bring_engine(folder: Path, new: NewFiles) -> bool:
-    """Have PlayCanvas's engine beside the page, if npm or somebody else has put it
-    anywhere.
+    """Put PlayCanvas's engine beside the page; return whether it was found, in the
+    folder or in `node_modules`.
 
-    One that an earlier export brought is part of this one, too; one that somebody put
-    there stays.
+    If an earlier export copied the engine, it becomes part of the new export. If a user
+    put it there, it stays.
     """
     present = folder / ENGINE
     if present.is_file() and ENGINE not in new.earlier:

@@ -1,12 +1,12 @@
-"""A bundle for stock web viewers: streamed SOG, the level-of-detail format of
-PlayCanvas and SuperSplat.
+"""Exports a bundle as streamed SOG, the level-of-detail format of PlayCanvas and
+SuperSplat.
 
-The asset is cut into chunks, which are subtrees of the bundle, and a viewer chooses a
-level for each. Any choice is a cut without gaps: up to the level at which a single
-group is left of a chunk its levels are those of the bundle, and above it every chunk is
-halved alone. No level of a chunk is empty: PlayCanvas's engine may keep drawing a finer
-level in place of an empty one. Chunks of one level are stored side by side in folders
-of SOG, and `lod-meta.json` says which gaussians of which folder they are.
+The asset is divided into chunks, which are subtrees of the bundle, and viewers choose a
+level for each chunk. Any choice is a cut without gaps: up to the level at which a chunk
+is a single group, the levels are those of the bundle; above it, each chunk is halved
+separately. No level of a chunk is empty, because PlayCanvas's engine may keep drawing a
+finer level instead of an empty one. Chunks of the same level are stored side by side in
+folders of SOG, and `lod-meta.json` lists the rows of each chunk in these folders.
 """
 
 import functools
@@ -44,15 +44,15 @@ from v3dg.upright import up_of
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
 DEFAULT_CHUNK = 16384
-# A folder is filled chunk by chunk until it holds this many gaussians: about a megabyte
-# to load at once.
+# Chunks are added to a folder until it has this number of gaussians, which is about one
+# megabyte to download at once.
 _FOLDER_GAUSSIANS = 1 << 17
-_FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
+_FOV_DEGREES = 50.0  # vertical field of view of a viewer's first camera
 
 
 class _Lod(TypedDict):
-    """The gaussians of a chunk at a level: `count` rows, from row `offset` on, of
-    the SOG folder with the number `file`."""
+    """The rows of a chunk at a level: `count` rows from row `offset` on, in the SOG
+    folder with index `file`."""
 
     file: int
     offset: int
@@ -60,8 +60,8 @@ class _Lod(TypedDict):
 
 
 class _Leaf(TypedDict):
-    """The levels of a chunk, by their numbers as text, and how far each is from the
-    finest."""
+    """The levels of a chunk, with numbers as strings, and the error of each level
+    compared with the finest."""
 
     lods: dict[str, _Lod]
     errors: list[float]
@@ -87,22 +87,22 @@ _TreeNode: TypeAlias = _BoundedLeaf | _Branch
 
 
 class _Folders(NamedTuple):
-    """Folders of SOG."""
+    """The written folders of SOG."""
 
     names: list[str]
-    leaves: list[_Leaf]  # by chunk
-    counts: list[int]  # gaussians of each level
+    leaves: list[_Leaf]  # indexed by chunk
+    counts: list[int]  # number of gaussians in each level
 
 
 @dataclass(frozen=True)
 class Export:
-    """Streamed SOG that was written.
+    """A finished export as streamed SOG.
 
     Attributes:
-        counts: Gaussians of each level, finest first.
-        chunks: Chunks in which a viewer chooses a level.
-        files: Folders with SOG.
-        bytes: Size of all files.
+        counts: Number of gaussians in each level, finest first.
+        chunks: Number of chunks, for each of which viewers choose a level.
+        files: Number of folders of SOG.
+        bytes: Total size of the written files.
     """
 
     counts: list[int]
@@ -120,29 +120,30 @@ def write_streamed_sog(
     progress: Progress = False,
     overwrite: bool = False,
 ) -> Export:
-    """Write a bundle as streamed SOG, replacing the files of an earlier export once all
-    is written.
+    """Write a bundle as streamed SOG. The files of an earlier export are replaced when
+    all new files are complete.
 
-    `settings.json` has the first view of SuperSplat's viewer. The export takes the
-    memory of one folder of SOG, and 128 KiB of pictures per chunk.
+    `settings.json` contains the first view for SuperSplat's viewer. The export needs
+    memory for one folder of SOG, and 128 KiB of pictures per chunk.
 
     Args:
-        bundle: A bundle, or its file.
-        folder: The folder to write; it may be new, empty, or have an earlier export.
+        bundle: A bundle, or the path of its file.
+        folder: The folder to write. It may be new, empty, or contain an earlier export.
             Missing parent folders are created. `v3dg-export.json` in it lists the
             written files, and only those are replaced or removed by a later export.
-        chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view
-            more closely; the least that a viewer can draw is a gaussian of each.
-        up: The axis that is up in the asset, which is turned to the axis that viewers
-            take for up. Most trained assets have y down and are not turned.
+        chunk: Largest number of the asset's gaussians in a chunk. Smaller chunks adapt
+            better to the view, but viewers draw at least one gaussian of each chunk.
+        up: The axis of the asset that points up. It is rotated to the up axis of
+            viewers, -y; most trained assets need no rotation. None uses the axis of
+            `v3dg.upright.up_of`.
         progress: See `v3dg.build_bundle`.
-        overwrite: Write to any folder, and replace files of the same names there; all
-            others stay.
+        overwrite: Whether to write to any folder and replace files with the same names
+            there. All other files stay.
 
     Raises:
-        ValueError: ``folder`` has other files, or the bundle's file; a file of the
+        ValueError: ``folder`` contains other files or the bundle's file; a file of the
             earlier export was changed; ``chunk`` is too small for the bundle's groups;
-            or a gaussian has values that SOG cannot hold.
+            or SOG cannot represent a value of a gaussian.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
@@ -162,7 +163,7 @@ def write_streamed_sog(
 def write_levels(
     plan: "Plan", place: Path, turn: Floats, advance: Callable[[int], object]
 ) -> Export:
-    """Fill a folder with the levels of a bundle, turned by a quaternion (4,)."""
+    """Write the levels of a bundle to a folder, rotated by a quaternion (4,)."""
     folders = _write_folders(place, plan, turn, advance)
     counts = folders.counts
     index = {
@@ -176,7 +177,7 @@ def write_levels(
         "tree": plan.tree(folders.leaves, turn),
     }
     _common.write_document(place / INDEX, index)
-    # A level of few gaussians does not show how far the asset reaches.
+    # A level with few gaussians would not show the extent of the asset.
     framed = next((level for level in range(plan.top, 0, -1) if counts[level] >= 1000), 0)
     gaussians = plan.bundle.level_gaussians(framed).transform(turn)
     _common.write_document(place / SETTINGS, _viewer_settings(gaussians))
@@ -186,7 +187,7 @@ def write_levels(
 def _write_folders(
     place: Path, plan: "Plan", turn: Floats, advance: Callable[[int], object]
 ) -> _Folders:
-    """Write the gaussians of all levels to one folder of SOG after another."""
+    """Write the gaussians of all levels to folders of SOG."""
     names: list[str] = []
     errors = ChunkErrors()
     leaves: list[_Leaf] = [
@@ -219,17 +220,17 @@ def _write_folders(
 
 
 def _write_sog(folder: Path, gaussians: Gaussians) -> None:
-    """Make a folder with gaussians as SOG."""
+    """Create a folder with gaussians as SOG."""
     folder.mkdir()
     for name, content in sog.encode(gaussians).items():
         (folder / name).write_bytes(content)
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
-    """Return the settings of SuperSplat's viewer: a camera that shows most of the
-    asset, and no effects."""
-    # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn
-    # about z.
+    """Return settings for SuperSplat's viewer: a camera that shows most of the asset,
+    and no effects."""
+    # SuperSplat's world has y up. It assumes that the asset has y down, and rotates it
+    # by half a turn about z.
     centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))
     distance = 1.2 * radius / math.sin(math.radians(_FOV_DEGREES) / 2)
     position = centre + distance * np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
@@ -240,14 +241,14 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class Plan:
-    """Chunks of a bundle: the groups of its level `top`, or all of a bundle of one
-    level.
+    """The division of a bundle into chunks: the groups of its level `top`, or the whole
+    bundle if it has only one level.
 
     Attributes:
-        chunk_of_cluster: (C,) number of the chunk, or -1 for clusters of coarser levels
-            than `top`.
-        chunk_of_group: (G,) number of the chunk that a group of level `top` is, else
-            -1.
+        chunk_of_cluster: (C,) index of the cluster's chunk; -1 for clusters of levels
+            coarser than `top`.
+        chunk_of_group: (G,) index of the chunk that is formed by a group of level
+            `top`; -1 for groups of other levels.
     """
 
     bundle: Bundle
@@ -260,8 +261,8 @@ class Plan:
     @classmethod
     def of(cls, bundle: Bundle, chunk: int) -> "Plan":
         check_type("bundle", bundle, Bundle, "a Bundle")
-        check("bundle", bundle.num_gaussians, "gaussians to export, got none")
-        chunk = whole(chunk, "chunk", "gaussians, 1 or more", 1, 1 << 62)
+        check("bundle", bundle.num_gaussians, "at least one gaussian to export, got none")
+        chunk = whole(chunk, "chunk", "at least 1 gaussian", 1, 1 << 62)
         clusters = bundle.clusters
         groups = bundle.groups
         if bundle.num_levels == 1:
@@ -277,13 +278,13 @@ class Plan:
                 break
             top = level
             ancestor = candidate
-        expected = f"at least {largest} gaussians, the size of a group of the asset"
+        expected = f"at least {largest} gaussians, the size of the largest group"
         check("chunk", top > 0, f"{expected}, got {chunk}")
         number = np.full(len(groups), -1, np.int64)
         tops = np.flatnonzero(groups.level == top)
         number[tops] = np.arange(len(tops))
-        # A cluster belongs to the group that replaces it; those at the top to the group
-        # that made them.
+        # Clusters belong to the chunk of the group that replaces them; those of level
+        # `top` belong to the group that made them.
         group = np.where(clusters.level < top, clusters.parent_group, clusters.own_group)
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
         return cls(bundle, top, len(tops), chunk_of_cluster, number)
@@ -294,7 +295,7 @@ class Plan:
 
     @property
     def num_gaussians(self) -> int:
-        """The number of gaussians of all levels."""
+        """The number of gaussians in all levels together."""
         total = int(self._sizes.sum())
         sizes = self._sizes[self.top]
         for _ in range(self.top + 1, self.num_levels):
@@ -304,9 +305,9 @@ class Plan:
 
     @functools.cached_property
     def _source(self) -> NDArray[np.int64]:
-        """(top + 1, K) the level of the bundle whose gaussians a chunk has at a level:
-        that one or, where the bundle has none there, the nearest finer one, else the
-        nearest coarser one."""
+        """(top + 1, K) the level of the bundle from which a level of a chunk is taken.
+        It is the same level or, if the chunk has no gaussians there, the nearest finer
+        one, else the nearest coarser one."""
         level = np.arange(self.top + 1)[:, None]
         present = np.where(self._bundle_sizes > 0, level, -1)
         finer = np.maximum.accumulate(present, axis=0)
@@ -316,7 +317,8 @@ class Plan:
 
     @functools.cached_property
     def _bundle_sizes(self) -> NDArray[np.int64]:
-        """(top + 1, K) gaussians of the bundle in each chunk."""
+        """(top + 1, K) number of gaussians of each chunk in the levels of the
+        bundle."""
         sizes = np.zeros((self.top + 1, self.num_chunks), np.int64)
         num_gaussians = np.diff(self.bundle.clusters.offset)
         used = self.chunk_of_cluster >= 0
@@ -326,24 +328,23 @@ class Plan:
 
     @property
     def _sizes(self) -> NDArray[np.int64]:
-        """(top + 1, K) gaussians that are written of each chunk."""
+        """(top + 1, K) number of written gaussians of each chunk."""
         return np.take_along_axis(self._bundle_sizes, self._source, axis=0)
 
     def levels(self) -> Iterator[Iterable[Gaussians]]:
-        """Yield the gaussians of all levels, each chunk by chunk."""
+        """Yield, for each level, the gaussians of its chunks."""
         for level in range(self.top + 1):
             yield self._parts(level)
         yield from self._halved_levels()
 
     def _parts(self, level: int) -> Iterator[Gaussians]:
-        """Yield the gaussians of a level up to `top`, chunk by chunk."""
+        """Yield the gaussians of the chunks at a level up to `top`."""
         for number, source in enumerate(self._source[level].tolist()):
             clusters = self._clusters_of_level(source)[number]
             yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in clusters])
 
     def _halved_levels(self) -> Iterator[list[Gaussians]]:
-        """Yield the levels above `top`; a chunk without gaussians has none there
-        either."""
+        """Yield the levels above `top`; chunks without gaussians stay empty."""
         chunks = list(self._parts(self.top))
         used = [number for number, chunk in enumerate(chunks) if len(chunk)]
         clusters = self.bundle.clusters
@@ -359,19 +360,19 @@ class Plan:
             yield parts
 
     def _clusters_of_level(self, level: int) -> list[NDArray[np.int64]]:
-        """Return the ids of the clusters of a level of the bundle, by chunk."""
+        """Return the indices of the clusters of a level of the bundle, by chunk."""
         if level not in self._clusters:
             self._clusters[level] = self.by_chunk(np.array(self.bundle.level_range(level)))
         return self._clusters[level]
 
     def by_chunk(self, clusters: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Return the ids of clusters, by the chunk that they are in."""
+        """Return the indices of clusters, grouped by chunk."""
         chunks = _common.rows_by(self.chunk_of_cluster[clusters], self.num_chunks)
         return [clusters[rows] for rows in chunks]
 
     def tree(self, leaves: list[_Leaf], turn: Floats) -> _TreeNode:
-        """Return the spatial index: the groups above the chunks, with their bounds as
-        axis-aligned boxes."""
+        """Return the spatial index: a tree of the groups above the chunks, with
+        axis-aligned bounding boxes."""
         parent = self.bundle.groups.parent
         nodes = self._leaf_nodes(leaves, turn)
         node_of_group = {
@@ -389,8 +390,8 @@ class Plan:
         return node_of_group[-1]
 
     def _leaf_nodes(self, leaves: list[_Leaf], turn: Floats) -> dict[int, _TreeNode]:
-        """Return the leaves with their bounds, by the number of their chunk, for chunks
-        that have gaussians."""
+        """Return the leaves of all chunks that have gaussians, with their bounds, by
+        the index of the chunk."""
         clusters = self.bundle.clusters
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
         corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn).T
@@ -404,7 +405,8 @@ class Plan:
 
 
 def _joined(nodes: list[_TreeNode]) -> _TreeNode:
-    """Return the only node, or a node that bounds several."""
+    """Return a node that bounds several nodes, or the node itself if there is only
+    one."""
     if len(nodes) == 1:
         return nodes[0]
     corners: list[list[float]] = []
@@ -414,5 +416,5 @@ def _joined(nodes: list[_TreeNode]) -> _TreeNode:
 
 
 def _bound(points: ArrayLike) -> _Bound:
-    """Return the lowest and the highest coordinates of points."""
+    """Return the minimum and the maximum coordinates of points."""
     return {"min": np.min(points, axis=0).tolist(), "max": np.max(points, axis=0).tolist()}

@@ -1,10 +1,10 @@
-"""Scenes and bundles as 3D Tiles 1.1: a group of a bundle is a tile, refined by
-replacement.
+"""Exports scenes and bundles as 3D Tiles 1.1: each group of a bundle is a tile, refined
+by replacement.
 
-A tile's content is what its group makes; its children are the groups below and, at the
-bottom, the gaussians of the asset. An instance is a tile that transforms the tileset of
-its bundle. Geometric errors are those at which a renderer's screen-space error of 16
-px, the usual limit, is v3dg's tolerance of 3 px².
+The content of a tile is the clusters that its group made. Its children are the groups
+below or, for groups of level 1, the gaussians of the asset. An instance is a tile that
+transforms the tileset of its bundle. Geometric errors are chosen so that a screen-space
+error of 16 px, the usual limit of renderers, corresponds to v3dg's tolerance of 3 px².
 """
 
 import math
@@ -35,13 +35,13 @@ from v3dg.upright import up_of
 
 TILESET = "tileset.json"
 CESIUM = "cesium"
-"""Folder beside the page with CesiumJS, which is not part of the export."""
+"""Folder beside the page for CesiumJS, which is not part of the export."""
 TILES_NEED = "npm install cesium@1.145.0", f"cp -r node_modules/cesium/Build/Cesium {{}}/{CESIUM}"
-"""Commands that bring CesiumJS, in the version that the page is tested with, to a
-folder."""
+"""Commands that put CesiumJS into a folder, in the version with which the page is
+tested."""
 
-_SCREEN_SPACE_ERROR = 16.0  # px, CesiumJS's limit where none is given
-# The content's y is up, the tiles' z.
+_SCREEN_SPACE_ERROR = 16.0  # px; the default limit of CesiumJS
+# Rotation from z up in tiles to y up in their glTF content.
 _TO_Y_UP = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 _CONTENT = "3DTILES_content_gltf"
 _EXTENSIONS = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
@@ -62,7 +62,7 @@ class _OptionalFields(TypedDict, total=False):
 
 
 class _Tile(_OptionalFields):
-    """A tile, as it stands in a tileset."""
+    """A tile in a tileset."""
 
     boundingVolume: _Volume
     geometricError: float
@@ -70,13 +70,13 @@ class _Tile(_OptionalFields):
 
 @dataclass(frozen=True)
 class Tiles:
-    """3D Tiles that were written.
+    """A finished export as 3D Tiles.
 
     Attributes:
-        bundles: Bundles, each of them once.
-        instances: Instances of them.
-        tiles: Tiles with gaussians, of all bundles.
-        bytes: Size of all files.
+        bundles: Number of distinct bundles.
+        instances: Number of instances.
+        tiles: Number of tiles with gaussians, in all bundles together.
+        bytes: Total size of the written files.
     """
 
     bundles: int
@@ -93,28 +93,29 @@ def write_tiles(
     progress: Progress = False,
     overwrite: bool = False,
 ) -> Tiles:
-    """Write a scene or a bundle as 3D Tiles, replacing the files of an earlier export
-    once all is written.
+    """Write a scene or a bundle as 3D Tiles. The files of an earlier export are
+    replaced when all new files are complete.
 
-    Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. The
-    importance of instances is left out, and so are, with a warning, opacity and tint.
-    The world's origin is at that of the tiles, the Earth's centre; viewers can put it
-    elsewhere.
+    Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. Importance,
+    opacity and tint of instances are left out, the latter two with a warning. The
+    origin of the world is the origin of the tiles, which is the Earth's centre; viewers
+    can move it elsewhere.
 
     Args:
-        subject: A scene or a bundle, or its file.
-        folder: The folder to write; it may be new, empty, or have an earlier export.
+        subject: A scene or a bundle, or the path of its file.
+        folder: The folder to write. It may be new, empty, or contain an earlier export.
             Missing parent folders are created. `v3dg-export.json` in it lists the
             written files, and only those are replaced or removed by a later export.
-        up: The axis that is up in the world; None uses the one of `v3dg.upright.up_of`.
+        up: The axis that points up in the world; None uses the axis of
+            `v3dg.upright.up_of`.
         progress: See `v3dg.build_bundle`.
-        overwrite: Write to any folder, and replace files of the same names there; all
-            others stay.
+        overwrite: Whether to write to any folder and replace files with the same names
+            there. All other files stay.
 
     Raises:
-        ValueError: ``folder`` has other files, or an input; a file of the earlier
-            export was changed; there is nothing to export; or a gaussian has values
-            that SPZ cannot hold.
+        ValueError: ``folder`` contains other files or an input; a file of the earlier
+            export was changed; there is nothing to export; or SPZ cannot represent a
+            value of a gaussian.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
@@ -128,9 +129,9 @@ def write_tiles(
     scene = _common.exported(scene, "3D Tiles")
     root = np.eye(4)
     root[:3, :3] = _common.rotation_to(up or up_of(content)[0], "z")
-    check("scene", len(scene), "instances to export, got none")
+    check("scene", len(scene), "at least one instance to export, got none")
     for bundle in scene.bundles:
-        check("bundle", bundle.num_gaussians, "gaussians to export, got none")
+        check("bundle", bundle.num_gaussians, "at least one gaussian to export, got none")
     names = _common.names_of(scene, reserved=[CESIUM])
     with replacing_export(Path(folder), scene, (TILESET, "index.html"), overwrite=overwrite) as new:
         trees = _write_bundles(scene, names, new.path, progress)
@@ -144,7 +145,7 @@ def write_tiles(
 
 
 def _write_bundles(scene: Scene, names: list[str], folder: Path, progress: Progress) -> list[_Tile]:
-    """Write a tileset of each bundle to a folder of its name; returns their root
+    """Write the tileset of each bundle to the folder with its name; return the root
     tiles."""
     trees: list[_Tile] = []
     with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
@@ -158,7 +159,7 @@ def _write_bundles(scene: Scene, names: list[str], folder: Path, progress: Progr
 
 
 def _instances(scene: Scene, names: list[str], trees: list[_Tile]) -> list[_Tile]:
-    """Return a tile for each instance; its content is the tileset of the bundle."""
+    """Return a tile for each instance, whose content is the tileset of the bundle."""
     return [
         {
             "transform": transform.T.ravel().tolist(),
@@ -173,7 +174,7 @@ def _instances(scene: Scene, names: list[str], trees: list[_Tile]) -> list[_Tile
 
 
 class _Writer:
-    """Writes the contents of a bundle's tiles."""
+    """Writes the content files of a bundle's tiles."""
 
     def __init__(self, bundle: Bundle, folder: Path, advance: Callable[[int], object]) -> None:
         self._bundle = bundle
@@ -192,7 +193,7 @@ class _Writer:
         self.tops = np.flatnonzero(groups.parent < 0).tolist() or [-1]
 
     def tile_of(self, group: int) -> _Tile:
-        """Return the tile of a group with all tiles below it; for -1, the tile of a
+        """Return the tile of a group with all tiles below it. -1 stands for all of a
         bundle without groups."""
         if group < 0:
             return self._tile("asset", np.arange(len(self._bundle.clusters)), 0.0, [])
@@ -225,8 +226,8 @@ class _Writer:
 
 
 def _parent(tiles: list[_Tile]) -> _Tile:
-    """Return the only tile, or a tile without content that is always refined to several
-    tiles."""
+    """Return a tile without content that is always refined to several tiles, or the
+    tile itself if there is only one."""
     if len(tiles) == 1 and "transform" not in tiles[0]:
         return tiles[0]
     volume = _box([_bounds(tile) for tile in tiles])
@@ -236,8 +237,8 @@ def _parent(tiles: list[_Tile]) -> _Tile:
 
 
 def _box(bounds: list[Floats]) -> _Volume:
-    """Return a bounding volume around boxes, each given by its lower and upper corner
-    (2, 3)."""
+    """Return a bounding volume around boxes, each given by its minimum and maximum
+    corner (2, 3)."""
     low = np.min([corners[0] for corners in bounds], axis=0)
     high = np.max([corners[1] for corners in bounds], axis=0)
     half = np.maximum((high - low) / 2, np.finfo(np.float32).tiny)
@@ -245,13 +246,13 @@ def _box(bounds: list[Floats]) -> _Volume:
 
 
 def _bounds(tile: _Tile) -> Floats:
-    """Lower and upper corner of a tile's box, after its transform."""
+    """Return the minimum and the maximum corner of a tile's box after its transform."""
     matrix = np.reshape(tile.get("transform", np.eye(4).ravel()), (4, 4)).T
     return _moved(tile["boundingVolume"], matrix)
 
 
 def _moved(volume: _Volume, matrix: Floats) -> Floats:
-    """Lower and upper corner of a volume after a transform."""
+    """Return the minimum and the maximum corner of a volume after a transform."""
     box = np.array(volume["box"])
     centre = matrix[:3, :3] @ box[:3] + matrix[:3, 3]
     half = np.abs(matrix[:3, :3] @ box[3:].reshape(3, 3).T).sum(axis=1)
@@ -259,7 +260,7 @@ def _moved(volume: _Volume, matrix: Floats) -> Floats:
 
 
 def _transforms(scene: Scene) -> Floats:
-    """Return (I, 4, 4) matrices of the instances."""
+    """Return the matrices (I, 4, 4) of the instances."""
     matrices = np.tile(np.eye(4), (len(scene), 1, 1))
     matrices[:, :3, :3] = scene.rotations * scene.scales[:, None, None]
     matrices[:, :3, 3] = scene.positions
@@ -268,8 +269,8 @@ def _transforms(scene: Scene) -> Floats:
 
 def _ball_of_leaves(scene: Scene, root: Floats) -> list[float]:
     """Return the centre and the radius of a ball around the finest level of all
-    instances. The page shows it first, because coarse gaussians, and with them the
-    tiles, reach far beyond it."""
+    instances. The page shows this ball first, because coarse gaussians, and therefore
+    the tiles, extend far beyond it."""
     boxes: list[Floats] = []
     for bundle in scene.bundles:
         leaves = bundle.clusters.box[np.array(bundle.level_range(0))].astype(np.float64)
@@ -289,8 +290,8 @@ def _write_tileset(
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
-        # This includes the extensions of other tilesets: CesiumJS reads the first one
-        # only.
+        # These include the extensions in other tilesets, because CesiumJS reads only
+        # those of the first tileset.
         "extensions": {_CONTENT: extensions},
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},

@@ -1,5 +1,5 @@
-"""Scenes and bundles as OpenUSD: levels of detail under UsdLod, instances as a
-PointInstancer."""
+"""Exports scenes and bundles as OpenUSD: the levels of detail with UsdLod, and
+instances as a PointInstancer."""
 
 import math
 import os
@@ -24,33 +24,34 @@ from v3dg.upright import up_of
 if TYPE_CHECKING:
     from pxr import Usd
 
-_PIXELS = 1920 * 1080  # pixels of the picture in which levels have the default tolerance
-_LEAST = 1e-30  # smallest distance
+# Pixels of the picture for which levels have the default tolerance.
+_PIXELS = 1920 * 1080
+_LEAST = 1e-30  # smallest distance, to avoid a division by 0
 _INSTANCES = "/world/instances"
 
 
 def write_usd(
     subject: Scene | Bundle | File, path: str | os.PathLike[str], *, up: Axis | None = None
 ) -> int:
-    """Write a scene or a bundle as OpenUSD, and return the bytes written; needs the
-    extra `usd`.
+    """Write a scene or a bundle as OpenUSD, and return the size of the file in bytes.
+    Needs the extra `usd`.
 
-    Each bundle is a prim with UsdLod's LODRootAPI, whose children are its levels,
-    finest first, as ParticleField3DGaussianSplat; they change where half of a level's
-    groups have the default tolerance in a picture of 1920 x 1080. A scene is a
-    PointInstancer of them. Positions are float32; importance, opacity and tint are left
-    out, the latter two with a warning.
+    Each bundle is a prim with UsdLod's LODRootAPI. Its children are the levels, finest
+    first, as ParticleField3DGaussianSplat. Levels switch where half of a level's groups
+    have the default tolerance in a picture of 1920 x 1080 px. A scene is a
+    PointInstancer of such prims. Positions are float32. Importance, opacity and tint of
+    instances are left out, the latter two with a warning.
 
     Args:
-        subject: A scene or a bundle, or its file.
+        subject: A scene or a bundle, or the path of its file.
         path: File to write, .usd, .usda, .usdc or .usdz.
-        up: The axis that is up in the world, which is turned to z; None uses the one of
-            `v3dg.upright.up_of`.
+        up: The axis that points up in the world, which is rotated to z; None uses the
+            axis of `v3dg.upright.up_of`.
 
     Raises:
         ImportError: usd-core is not installed.
-        ValueError: The name has another suffix, there is nothing to export, or a
-            gaussian has invalid values.
+        ValueError: The suffix is unknown, there is nothing to export, or a gaussian has
+            invalid values.
         OSError: The file cannot be written.
 
     Source: Pixar, OpenUSD 26.11, UsdVol and UsdLod.
@@ -61,7 +62,7 @@ def write_usd(
     pxr = usd.pxr()
     scene = Scene.of(content)
     scene = _common.exported(scene, "OpenUSD")
-    check("scene", len(scene), "instances to export, got none")
+    check("scene", len(scene), "at least one instance to export, got none")
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")
     stage.SetDefaultPrim(world.GetPrim())
@@ -103,8 +104,8 @@ def _define_levels(stage: "Usd.Stage", place: str, bundle: Bundle) -> None:
     high = bundle.clusters.box[:, 1].max(axis=0)
     radius = float(np.linalg.norm(high - low)) / 2
     detail = _common.detail_of(bundle)
-    # Share of the picture that the ball around the box covers from where level 1 is
-    # enough.
+    # The share of the picture that the ball around the box covers at the distance from
+    # which on level 1 is fine enough.
     share = math.pi * DEFAULT_TOLERANCE / _PIXELS * (radius / max(detail["reach"], _LEAST)) ** 2
     sizes = [share / detail["ratio"] ** (2 * level) for level in range(bundle.num_levels - 1)]
     heuristic = pxr.UsdLod.ScreenSizeHeuristic.Define(stage, f"/lod{place.replace('/', '_')}")

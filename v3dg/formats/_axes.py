@@ -1,8 +1,9 @@
-"""The axes of gaussians in memory and in files, and the turns between them.
+"""The axes of gaussians in memory and in files, and the conversions between them.
 
-Axes are named by where x, y and z point, as SPZ's specification names them: R or L
-(right, left), U or D (up, down), F or B (forward, back). Memory has those of trainers'
-`.ply` files, right, down, forward. Turns that change nothing but signs are exact.
+Axes are named by the directions of x, y and z, as in the specification of SPZ: R or L
+(right, left), U or D (up, down), F or B (forward, back). In memory they are right,
+down, forward, as in the `.ply` files of trainers. Conversions that only change signs
+are exact.
 """
 
 from dataclasses import replace
@@ -16,7 +17,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.rotations import quaternion_from_rotation
 
 MEMORY = "RDF"
-"""The axes of gaussians in memory, with which -y is up."""
+"""The axes of gaussians in memory, where -y points up."""
 MEMORY_UP: Axis = "-y"
 OPENGL = "RUB"
 """The axes of `.spz`, and of OpenUSD with y up."""
@@ -25,8 +26,8 @@ GLTF = "LUF"
 Z_UP = "RFU"
 """The axes of OpenUSD with z up, and of 3D Tiles."""
 
-# The axes of gaussians of which an axis is up: those that differ least from the axes in
-# memory.
+# For each axis that can point up: complete axes that differ as little as possible from
+# those in memory.
 _AXES_FROM_UP: dict[Axis, str] = {
     "x": "URF",
     "y": OPENGL,
@@ -43,13 +44,13 @@ _DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "F": (0.0, 0.0, 1.0),
     "B": (0.0, 0.0, -1.0),
 }
-# The sign of each harmonic under a change of sign of x, y and z: the coordinates that
-# it is odd in.
+# The coordinates in which each spherical harmonic is odd. Changing the sign of such a
+# coordinate changes the sign of the harmonic.
 _ODD = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
-# Limits of a ground: the least share of the points in it; the largest thickness and the
-# least width, relative to the extent of the points; the largest share of the points
-# below it, and the least share above it.
+# Limits for the detection of a ground: its minimum share of the points, its maximum
+# thickness and minimum width relative to the extent of all points, the maximum share of
+# points below it, and the minimum share of points above it.
 _GROUND_SHARE = 0.3
 _GROUND_THICKNESS = 0.03
 _GROUND_WIDTH = 0.7
@@ -59,14 +60,14 @@ _LEAST_POINTS = 256
 
 
 def axes_of_up(up: Axis) -> str:
-    """Return the axes of gaussians for which this axis is up; ValueError for another
-    name."""
+    """Return the axes of gaussians for which this axis points up; raise ValueError for
+    an invalid name."""
     one_of(up, "up", tuple(_AXES_FROM_UP))
     return _AXES_FROM_UP[up]
 
 
 def up_of_axes(axes: str) -> Axis:
-    """The axis that points up."""
+    """Return the axis that points up."""
     for name, letter in zip("xyz", axes, strict=True):
         if letter == "U":
             return name  # type: ignore[return-value]
@@ -76,16 +77,16 @@ def up_of_axes(axes: str) -> Axis:
 
 
 def turn(source: str, target: str) -> Floats:
-    """Return the (3, 3) matrix that takes vectors from one set of axes to another: a
-    rotation, or a rotation with a reflection."""
+    """Return the (3, 3) matrix that converts vectors between two sets of axes: a
+    rotation, possibly with a reflection."""
     rows = np.array([_DIRECTIONS[letter] for letter in target])
     columns = np.array([_DIRECTIONS[letter] for letter in source]).T
     return np.asarray(rows @ columns) + 0.0
 
 
 def turned(gaussians: Gaussians, source: str, target: str) -> Gaussians:
-    """Return gaussians on the host, taken from one set of axes to another; arrays that
-    do not change are shared."""
+    """Return gaussians on the host, converted between two sets of axes; arrays that do
+    not change are shared."""
     matrix = turn(source, target)
     if np.array_equal(np.abs(matrix), np.eye(3)):
         return _mirrored(gaussians, np.diag(matrix))
@@ -99,8 +100,8 @@ def turned(gaussians: Gaussians, source: str, target: str) -> Gaussians:
 def _mirrored(gaussians: Gaussians, signs: Floats) -> Gaussians:
     """Return gaussians with the signs of some coordinates changed, exactly.
 
-    A reflection M takes the rotation R of a gaussian to M R, which stands for the same
-    gaussian as the rotation M R M, whose quaternion differs in signs alone.
+    A reflection M turns the rotation R of a gaussian into M R. The rotation M R M gives
+    the same gaussian, and its quaternion differs from that of R only in signs.
     """
     if (signs == 1).all():
         return gaussians
@@ -124,8 +125,9 @@ def up_of_ground(points: NDArray[np.floating]) -> Axis | None:
     """Return which of y, -y and z is up, if the points (N, 3) show a ground; None if
     they do not.
 
-    A ground is thin and wide, has many of the points, many of the others above it, and
-    next to none below it. It is only sought across y and z.
+    A ground is thin and wide and contains many of the points. Many other points are
+    above it, and hardly any below it. Only grounds perpendicular to y or z are
+    detected.
     """
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     if len(finite) < _LEAST_POINTS:
@@ -141,8 +143,9 @@ def up_of_ground(points: NDArray[np.floating]) -> Axis | None:
 
 
 def _side_above(points: Floats, axis: int) -> int:
-    """Return 1 or -1, the side of a ground across an axis on which the points lie; 0
-    without a ground."""
+    """Return on which side of a ground the points lie along an axis: 1 for larger
+    coordinates, -1 for smaller ones, 0 if there is no ground perpendicular to the
+    axis."""
     order = np.argsort(points[:, axis])
     heights = points[order, axis]
     size = int(_GROUND_SHARE * len(heights))

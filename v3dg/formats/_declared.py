@@ -1,4 +1,4 @@
-"""The declarations of a file about its gaussians, beside their numbers."""
+"""What a file declares about its gaussians, apart from their values."""
 
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -9,16 +9,16 @@ from v3dg.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Declared:
-    """The declarations of a file, or of its format, about its gaussians.
+    """What a file, or its format, declares about its gaussians.
 
     Attributes:
-        up: The axis that is up among the gaussians as they are read; None if neither
-            the file nor its format determines it.
-        up_reason: Why `up` is what it is, as a phrase.
-        antialiased: Whether opacities were trained to be compensated for the filter of
-            the rasterizer; None if the file does not say.
-        notes: What is in the file and was not understood, or was read otherwise than it
-            is written; each is one sentence without the name of the file.
+        up: The axis that points up, in the coordinates of the gaussians in memory; None
+            if neither the file nor its format determines it.
+        up_reason: The source of `up`, as a phrase for messages.
+        antialiased: Whether the gaussians were trained with opacities that compensate
+            for the filter of the rasterizer; None if the file does not declare it.
+        notes: Sentences about content of the file that was ignored or converted,
+            without the name of the file.
     """
 
     up: Axis | None = None
@@ -34,8 +34,8 @@ _OF_GAUSSIANS: WeakKeyDictionary[Gaussians, Declared] = WeakKeyDictionary()
 
 
 def declare(gaussians: Gaussians, declared: Declared) -> Gaussians:
-    """Remember what the file of these gaussians declares; gaussians that are made from
-    them declare nothing."""
+    """Store what the file of these gaussians declares. Gaussians derived from them do
+    not inherit the declarations."""
     _OF_GAUSSIANS[gaussians] = declared
     return gaussians
 

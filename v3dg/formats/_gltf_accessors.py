@@ -1,5 +1,5 @@
-"""The numbers of a glTF file: accessors of every kind, dense, sparse and without a
-view.
+"""Reads the numbers of a glTF file from accessors of every kind: dense, sparse, and
+without a buffer view.
 
 Source: glTF 2.0, section 3.6.2.
 """
@@ -24,23 +24,25 @@ _MOST_ELEMENTS = 1 << 40
 
 
 def count_of(accessor: Node) -> int:
-    """Number of elements of an accessor."""
+    """Return the number of elements of an accessor."""
     return integer_of(accessor.field("count"), "a number of gaussians", 0, _MOST_ELEMENTS)
 
 
 def has_data(accessor: Node) -> bool:
-    """Whether an accessor has numbers of its own, which are zeros otherwise."""
+    """Return whether an accessor has data; the elements of an accessor without data are
+    zero."""
     return accessor.has("bufferView") or accessor.has("sparse")
 
 
 def column(
     document: Document, accessor: Node, count: int, widths: Sequence[int]
 ) -> Callable[[slice], Floats]:
-    """A function from a slice to these rows of an attribute, in double precision.
+    """Return a function that takes a slice and returns these rows of an attribute as
+    doubles.
 
     Args:
-        count: Number of rows, which has been accepted as plausible.
-        widths: Numbers of a row that are accepted.
+        count: Number of rows. The caller has checked that it is plausible.
+        widths: Accepted numbers of components in a row.
     """
     dtype = _dtype_of(accessor.field("componentType"), _DTYPES)
     kind = accessor.field("type")
@@ -62,13 +64,16 @@ def column(
 
 
 def indices(document: Document, accessor: Node, limit: int) -> NDArray[np.int64]:
-    """The numbers of vertices that a primitive names, each below ``limit``."""
+    """Return the vertex indices of a primitive, each of which is below ``limit``."""
     dtype = _dtype_of(accessor.field("componentType"), _INDEX_DTYPES)
     if accessor.field("type").value != "SCALAR":
         raise accessor.field("type").error("SCALAR")
     shape = (count_of(accessor), 1)
     if accessor.has("sparse") or not accessor.has("bufferView"):
-        raise accessor.problem("expected indices in a buffer view, got others, which are not read")
+        raise accessor.problem(
+            "expected indices in a buffer view, got sparse ones or none, which this reader does "
+            "not support"
+        )
     values = _rows(document, accessor, dtype, shape, is_strided=True)[:, 0].astype(np.int64)
     if len(values) and values.max() >= limit:
         raise accessor.problem(f"expected indices below {limit}, got {values.max()}")
@@ -78,7 +83,8 @@ def indices(document: Document, accessor: Node, limit: int) -> NDArray[np.int64]
 def _with_sparse(
     document: Document, sparse: Node, rows: NDArray[np.generic]
 ) -> NDArray[np.generic]:
-    """Rows of which some are replaced; they are copied."""
+    """Return a copy of the rows in which those listed by a sparse accessor are
+    replaced."""
     num_rows = len(rows)
     count = integer_of(sparse.field("count"), f"1 to {num_rows}", 1, num_rows)
     places = sparse.field("indices")
@@ -86,7 +92,7 @@ def _with_sparse(
     numbers = _rows(document, places, kind, (count, 1), is_strided=False)[:, 0].astype(np.int64)
     is_ascending = bool((np.diff(numbers) > 0).all()) and numbers[-1] < num_rows
     if not is_ascending:
-        raise places.problem(f"expected ascending numbers below {num_rows}, got others")
+        raise places.problem(f"expected ascending indices below {num_rows}, got others")
     values = _rows(
         document, sparse.field("values"), rows.dtype, (count, rows.shape[1]), is_strided=False
     )
@@ -103,7 +109,8 @@ def _rows(
     *,
     is_strided: bool,
 ) -> NDArray[np.generic]:
-    """Rows in the buffer view of an accessor, or of a part of a sparse one."""
+    """Return rows from the buffer view of an accessor, or of one part of a sparse
+    accessor."""
     count, width = shape
     number = holder.field("bufferView")
     content = document.view(number)
@@ -113,7 +120,9 @@ def _rows(
         stride = document.stride(number, size)
     first = offset_of(holder, len(content))
     if count and first + (count - 1) * stride + size > len(content):
-        raise holder.problem(f"expected {count} values in its view, got {len(content)} bytes")
+        raise holder.problem(
+            f"expected {count} elements in its buffer view, got one of {len(content)} bytes"
+        )
     strided: NDArray[np.generic] = np.ndarray(
         shape, dtype, content, first, (stride, dtype.itemsize)
     )

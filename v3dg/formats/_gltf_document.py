@@ -1,4 +1,5 @@
-"""The document of a glTF file, `.glb` or `.gltf`, and the buffers that it names.
+"""The JSON document of a glTF file, `.glb` or `.gltf`, and the buffers that it refers
+to.
 
 Source: glTF 2.0, sections 3.2 (URIs), 3.6.1 (buffers and views) and 4 (GLB).
 """
@@ -18,29 +19,30 @@ MAGIC = 0x46546C67  # "glTF"
 JSON_CHUNK = 0x4E4F534A  # "JSON"
 BINARY_CHUNK = 0x004E4942  # "BIN\0"
 
-# Parsed JSON takes many times the memory of its text, but for long strings.
-_MOST_JSON = 1 << 20  # bytes, without data: URIs
+# Parsed JSON takes many times the memory of its text, except for long strings.
+_MOST_JSON = 1 << 20  # bytes, not counting data: URIs
 _DATA_URI = re.compile(rb'"data:[^"\\]*"')
 _MOST_NAME = 255  # bytes of a file name
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
-# Extensions of buffer views whose bytes are packed.
+# Extensions that compress the bytes of buffer views.
 _PACKED_VIEWS = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
 class Document:
-    """The JSON of a glTF file, whose arrays are looked up lazily, and its buffers,
-    which are read when they are needed."""
+    """The JSON of a glTF file and its buffers. Objects are looked up, and buffers read,
+    when they are needed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.claims = Claims()
         self._binary: memoryview | None = None
         self._buffers: dict[int, memoryview] = {}
-        # By device and inode: a file may be named by many buffers, and in many ways.
+        # By device and inode, because several buffers may refer to one file by
+        # different names.
         self._files: dict[tuple[int, int], memoryview] = {}
         content = self.claims.read(path)
         is_binary = content[:4] == b"glTF" or path.suffix.lower() != ".gltf"
-        # A copy of what was at a URL has no suffix.
+        # A file downloaded from a URL may have no suffix.
         if not is_binary or content[:1] == b"{":
             text = content
             expected = "a .gltf file, glTF 2.0 as JSON in UTF-8"
@@ -49,14 +51,18 @@ class Document:
             expected = "a complete .glb file of glTF 2.0"
         num_data = sum(match.end() - match.start() for match in _DATA_URI.finditer(text))
         structure = len(text) - num_data
-        check(path, structure <= _MOST_JSON, f"at most {_MOST_JSON} bytes of JSON, got {structure}")
+        check(
+            path,
+            structure <= _MOST_JSON,
+            f"at most {_MOST_JSON} bytes of JSON, got {structure}; the file has too many objects",
+        )
         with value_errors(path, expected):
             self.root = Node(parse_json(text.decode("utf-8")), str(path), "")
         self._check_version()
         self._arrays: dict[str, list[Json]] = {}
 
     def _text_of_binary(self, content: bytes) -> bytes:
-        """The JSON of a `.glb`; its binary chunk is the one after that."""
+        """Return the JSON of a `.glb`; keep its binary chunk, which follows."""
         expected = "a complete .glb file of glTF 2.0"
         check(self.path, len(content) >= 20, f"{expected}, got {len(content)} bytes")
         magic, version, total, size, kind = struct.unpack_from("<IIIII", content)
@@ -70,14 +76,16 @@ class Document:
             check(
                 self.path,
                 size_of_second <= len(tail) - 8,
-                f"{expected}, got a chunk of {size_of_second} bytes where {len(tail) - 8} are left",
+                f"{expected}, got a chunk of {size_of_second} bytes where only {len(tail) - 8} "
+                "follow",
             )
             if kind_of_second == BINARY_CHUNK:
                 self._binary = tail[8 : 8 + size_of_second]
         return content[20 : 20 + size]
 
     def _check_version(self) -> None:
-        """Raise ValueError for a document of another version of glTF than 2.0."""
+        """Raise ValueError if the document requires a version of glTF other than
+        2.0."""
         if not self.root.has("asset"):
             return
         asset = self.root.field("asset")
@@ -90,7 +98,7 @@ class Document:
                     raise version.error("glTF 2.0")
 
     def array(self, kind: str) -> list[Json]:
-        """One of the root's arrays; an empty one if there is none."""
+        """Return one of the root's arrays; an empty list if it is missing."""
         if kind not in self._arrays:
             values: Json = []
             if self.root.has(kind):
@@ -101,19 +109,19 @@ class Document:
         return self._arrays[kind]
 
     def index(self, kind: str, number: Node) -> int:
-        """A number of an item of one of the root's arrays."""
+        """Return a checked index into one of the root's arrays."""
         last = len(self.array(kind)) - 1
         return integer_of(number, f"0 to {last}", 0, last)
 
     def item(self, kind: str, number: Node | int) -> Node:
-        """The item of one of the root's arrays with a number."""
+        """Return an item of one of the root's arrays, by its index."""
         index = number
         if isinstance(index, Node):
             index = self.index(kind, index)
         return Node(self.array(kind)[index], self.root.file, f"{kind}[{index}]")
 
     def view(self, number: Node) -> memoryview:
-        """The bytes of a buffer view."""
+        """Return the bytes of a buffer view."""
         view = self.item("bufferViews", number)
         buffer = self._buffer(view)
         first = offset_of(view, len(buffer))
@@ -122,14 +130,14 @@ class Document:
         return buffer[first : first + num_bytes]
 
     def stride(self, number: Node, default: int) -> int:
-        """Bytes from one element of a buffer view to the next."""
+        """Return the number of bytes from one element of a buffer view to the next."""
         view = self.item("bufferViews", number)
         if not view.has("byteStride"):
             return default
         return integer_of(view.field("byteStride"), "4 to 252", 4, 252)
 
     def buffer_files(self) -> list[Path]:
-        """The files that buffers name."""
+        """Return the files that buffers refer to."""
         files = []
         for index in range(len(self.array("buffers"))):
             buffer = self.item("buffers", index)
@@ -138,8 +146,8 @@ class Document:
         return list(dict.fromkeys(files))
 
     def claim_buffers(self) -> None:
-        """Let the sizes of the files of buffers count; one that cannot be read may not
-        be needed."""
+        """Add the files of all buffers to the claims. Files that cannot be read are
+        ignored here, because they may not be needed."""
         for path in self.buffer_files():
             with contextlib.suppress(OSError, ValueError), self.claims.open(path):
                 pass
@@ -159,8 +167,11 @@ class Document:
         else:
             for name in _PACKED_VIEWS:
                 if view.has("extensions") and view.field("extensions").has(name):
-                    raise view.problem(f"expected plain bytes, got {name}, which is not read")
-            raise buffer.problem("expected a uri, got a buffer without content")
+                    raise view.problem(
+                        f"expected uncompressed data, got {name}, which this reader does not "
+                        "support"
+                    )
+            raise buffer.problem("expected a uri, got a buffer without data")
         if buffer.has("byteLength"):
             limit = len(content)
             size = integer_of(buffer.field("byteLength"), f"at most {limit} bytes", 0, limit)
@@ -168,7 +179,7 @@ class Document:
         return content
 
     def _content_at(self, uri: Node) -> memoryview:
-        """The bytes at a data: URI, or in a file beside the document."""
+        """Return the bytes of a data: URI, or of a file beside the document."""
         if _is_data(uri):
             media_type, _, payload = uri.value.partition(",")
             if not media_type.endswith(";base64"):
@@ -176,7 +187,7 @@ class Document:
             try:
                 return memoryview(base64.b64decode(payload, validate=True))
             except ValueError:
-                raise uri.error("data in base64 that is whole") from None
+                raise uri.error("complete data in base64") from None
         path = self._path_of(uri)
         try:
             status = os.stat(path)
@@ -189,10 +200,10 @@ class Document:
         return self._files[key]
 
     def _path_of(self, uri: Node) -> Path:
-        """The file that a relative URI names; nothing outside of the document's folder
-        is read."""
+        """Return the file at a relative URI. URIs that lead out of the document's
+        folder are rejected."""
         text = uri.text()
-        expected = "a path below the folder of the document, or a data: URI"
+        expected = "a path inside the folder of the document, or a data: URI"
         if _SCHEME.match(text) or "?" in text or "#" in text:
             raise uri.error(expected)
         name = unquote(text)
@@ -209,14 +220,14 @@ def _is_data(uri: Node) -> bool:
 
 
 def offset_of(node: Node, limit: int) -> int:
-    """The byteOffset of a view or an accessor, by default 0."""
+    """Return the byteOffset of a view or an accessor; the default is 0."""
     if not node.has("byteOffset"):
         return 0
     return integer_of(node.field("byteOffset"), f"0 to {limit}", 0, limit)
 
 
 def name_text(name: str) -> str:
-    """A name from a document as part of a message."""
+    """Return a name from a document as text for a message."""
     if name and is_one_line(name) and len(name) <= 60:
         return name
     return json_text(name)

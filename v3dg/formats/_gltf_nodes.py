@@ -1,7 +1,8 @@
-"""Where a glTF file places its meshes: the nodes of its scene, and their transforms.
+"""Finds the meshes of a glTF file's scene, and the transforms of the nodes that place
+them.
 
 Source: glTF 2.0, sections 3.5.2 (node hierarchy) and 3.5.3 (transformations);
-KHR_gaussian_splatting, Dependencies on glTF, says which transforms are defined.
+KHR_gaussian_splatting, Dependencies on glTF (allowed transforms).
 """
 
 from collections.abc import Iterator
@@ -23,18 +24,19 @@ from v3dg.rotations import (
 
 _INSTANCING = "EXT_mesh_gpu_instancing"
 _PARTS = ("translation", "rotation", "scale")
-# How far the determinant of a rotation may be from 1, and how much scales that count
-# as one may differ: matrices come from float32.
+# Largest difference of a rotation's determinant from 1, and largest relative difference
+# of scales that count as equal. Matrices come from float32.
 _MOST_SHEAR = 1e-4
 _MOST_SPREAD = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A mesh, and the (4, 4) matrix from it to the scene; None for the identity.
+    """A mesh, and the (4, 4) matrix from mesh to scene coordinates; None for the
+    identity.
 
     Attributes:
-        node: The node that has the mesh, or the mesh itself if there are no nodes.
+        node: The node that places the mesh, or the mesh itself if there are no nodes.
     """
 
     mesh: int
@@ -43,8 +45,8 @@ class Placement:
 
 
 def placements(document: Document) -> tuple[list[Placement], list[str]]:
-    """The meshes of the scene that is shown, in the order of its nodes, and what to
-    tell of it."""
+    """Return the placements of the default scene's meshes, in the order of its nodes,
+    and notes about other scenes."""
     meshes = range(len(document.array("meshes")))
     if document.array("scenes"):
         number = 0
@@ -61,7 +63,7 @@ def placements(document: Document) -> tuple[list[Placement], list[str]]:
 
 
 def _scene_notes(document: Document, number: int) -> list[str]:
-    """That there are other scenes, which are not read."""
+    """Return a note if there are other scenes, which are ignored."""
     count = len(document.array("scenes"))
     if count == 1:
         return []
@@ -69,11 +71,11 @@ def _scene_notes(document: Document, number: int) -> list[str]:
     name = ""
     if scene.has("name") and isinstance(scene.field("name").value, str):
         name = f" ({name_text(scene.field('name').value)})"
-    return [f"Scene {number} of {count}{name} is read, the others are left out."]
+    return [f"Scene {number} of {count}{name} is read, and the others are ignored."]
 
 
 def _roots(document: Document) -> list[int]:
-    """The nodes that are no children of others."""
+    """Return the nodes that have no parent."""
     is_child = np.zeros(len(document.array("nodes")), bool)
     for index in range(len(is_child)):
         for child in _children(document, document.item("nodes", index)):
@@ -88,20 +90,22 @@ def _children(document: Document, node: Node) -> list[int]:
 
 
 def _walk(document: Document, roots: list[int]) -> Iterator[Placement]:
-    """The meshes of nodes and their descendants; each node is met once, so that work
-    and memory are bounded by the document."""
+    """Yield the meshes of nodes and their descendants. Each node is visited at most
+    once, so that time and memory are bounded by the size of the document."""
     is_met = np.zeros(len(document.array("nodes")), bool)
     stack: list[tuple[int, Floats | None]] = [(root, None) for root in reversed(roots)]
     while stack:
         index, parent = stack.pop()
         node = document.item("nodes", index)
         if is_met[index]:
-            raise node.problem("expected one parent at most and no cycle, got a second way to it")
+            raise node.problem("expected at most one parent and no cycle, got a second parent")
         is_met[index] = True
         matrix = _product(parent, _local_matrix(node))
         if node.has("mesh"):
             if node.has("extensions") and node.field("extensions").has(_INSTANCING):
-                raise node.problem(f"expected one mesh, got {_INSTANCING}, which is not read")
+                raise node.problem(
+                    f"expected one mesh, got {_INSTANCING}, which this reader does not support"
+                )
             yield Placement(document.index("meshes", node.field("mesh")), matrix, node)
         stack += [(child, matrix) for child in reversed(_children(document, node))]
 
@@ -111,12 +115,12 @@ def _product(parent: Floats | None, local: Floats | None) -> Floats | None:
         return local
     if local is None:
         return parent
-    with np.errstate(over="ignore", invalid="ignore"):  # checked where a mesh is placed
+    with np.errstate(over="ignore", invalid="ignore"):  # checked in `placed`
         return np.asarray(parent @ local)
 
 
 def _local_matrix(node: Node) -> Floats | None:
-    """The transform of a node as a (4, 4) matrix; None for the identity."""
+    """Return the transform of a node as a (4, 4) matrix; None for the identity."""
     parts = [name for name in _PARTS if node.has(name)]
     if node.has("matrix"):
         if parts:
@@ -138,7 +142,7 @@ def _local_matrix(node: Node) -> Floats | None:
 
 
 def _rotation_of(node: Node) -> Floats:
-    """The matrix of a quaternion x y z w."""
+    """Return the (3, 3) matrix of a quaternion x y z w."""
     x, y, z, w = node.vector(4)
     quaternion = np.array([w, x, y, z])
     if not quaternion.any():
@@ -147,8 +151,8 @@ def _rotation_of(node: Node) -> Floats:
 
 
 def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
-    """The gaussians of a mesh in the scene; ValueError names the node if its transform
-    is anything but a rotation, a translation and positive scales."""
+    """Return the gaussians of a mesh in scene coordinates. A transform other than a
+    rotation, a translation and positive scales is a ValueError that names the node."""
     matrix = placement.matrix
     if matrix is None:
         return gaussians
@@ -171,10 +175,12 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
 
 
 def _stretched(gaussians: Gaussians, factors: Floats) -> Gaussians:
-    """Gaussians whose space is scaled along its axes; colours stay as they are.
+    """Return gaussians after scaling space by a factor along each axis; colours stay
+    the same.
 
-    The singular values of the stretched axes are the new scales: Splat Reconstruction
-    in KHR_gaussian_splatting.
+    The new scales are the singular values of the scaled axes of each gaussian.
+
+    Source: KHR_gaussian_splatting, Splat Reconstruction.
     """
 
     def decode(rows: slice) -> tuple[Floats, ...]:
@@ -183,7 +189,8 @@ def _stretched(gaussians: Gaussians, factors: Floats) -> Gaussians:
         scales = gaussians.scales[rows].astype(np.float64)
         axes = rotation_from_quaternion(normalised(quats)) * scales[:, None, :]
         axes *= factors[:, None]
-        is_good = np.isfinite(axes).all(axis=(1, 2))  # others cannot be drawn, and stay
+        # Gaussians with other values cannot be drawn, and are not changed.
+        is_good = np.isfinite(axes).all(axis=(1, 2))
         rotations, lengths, _ = np.linalg.svd(axes[is_good])
         rotations[:, :, 2] *= np.sign(np.linalg.det(rotations))[:, None]
         quats[is_good] = quaternions_from_rotations(rotations)

@@ -1,9 +1,9 @@
-"""The gaussians of a glTF primitive: its attributes, or the `.spz` that replaces them,
-and what it declares.
+"""Reads the gaussians of a glTF primitive, from attributes or from an embedded `.spz`,
+and the properties that the primitive declares.
 
 Source: KHR_gaussian_splatting, Ellipse Kernel (attributes) and Extending Mesh
-Primitives (properties); its drafts for other names. What follows from each is in
-docs/formats.md.
+Primitives (properties); earlier drafts for other names. docs/formats.md describes how
+each property is read.
 """
 
 from collections.abc import Callable
@@ -25,15 +25,17 @@ from v3dg.rotations import normalised
 
 NAME = "KHR_gaussian_splatting"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
-# A draft that is a primitive's own extension, beside those within NAME.
+# An extension of a draft. It belongs to the primitive itself, while the others are
+# nested in NAME.
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
 _SPZ_WITHIN = (SPZ, "KHR_gaussian_splatting_compression_spz")
 READ_EXTENSIONS = frozenset({NAME, *_SPZ_WITHIN, _SPZ_ALONE, "KHR_mesh_quantization"})
-# Drafts had `_SCALE` in place of `KHR_gaussian_splatting:SCALE`, and so on.
+# Drafts call the attribute `KHR_gaussian_splatting:SCALE` just `_SCALE`; the same holds
+# for the other attributes.
 _PREFIXES = (f"{NAME}:", "_")
 
 _LINEAR = "lin_rec709_display"
-# The values of properties that are read as they are meant, with the default first.
+# The supported values of each property, with the default first.
 _PROPERTIES = {
     "kernel": ("ellipse",),
     "colorSpace": ("srgb_rec709_display", _LINEAR),
@@ -41,15 +43,16 @@ _PROPERTIES = {
     "sortingMethod": ("cameraDistance",),
 }
 _POINTS = 0
-_TRIANGLES = 4  # the mode of a primitive that names none
-# Directions in which colours of another transfer function are fitted: enough for 16
-# coefficients.
+_TRIANGLES = 4  # the mode of a primitive without a mode
+# Number of directions in which converted colours are fitted by spherical harmonics:
+# enough for 16 coefficients.
 _NUM_DIRECTIONS = 64
-_FITTED_AT_ONCE = 1 << 12  # gaussians, so that their colours stay in the cache
+# Gaussians that are fitted together, so that their colours stay in the cache.
+_FITTED_AT_ONCE = 1 << 12
 
 
 def is_gaussians(primitive: Node) -> bool:
-    """Whether a primitive of a mesh has gaussians."""
+    """Return whether a primitive of a mesh has gaussians."""
     if not primitive.has("extensions"):
         return False
     extensions = primitive.field("extensions")
@@ -57,24 +60,25 @@ def is_gaussians(primitive: Node) -> bool:
 
 
 def coefficients(degree: int) -> list[str]:
-    """Attributes of spherical harmonics, in order, without a prefix."""
+    """Return the names of the attributes of spherical harmonics, in order, without a
+    prefix."""
     return [f"SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
 
 
 @dataclass(frozen=True)
 class _Packed:
-    """The `.spz` of a primitive, and what its header has."""
+    """The `.spz` of a primitive, and its header."""
 
     content: memoryview
     header: spz.Header
 
 
 class Primitive:
-    """A primitive of gaussians, of which nothing but its size is read at first.
+    """A primitive of gaussians. Until `read` is called, only its size is read.
 
     Attributes:
-        count: Number of gaussians.
-        num_rows: Number of vertices, of which indices may choose some.
+        count: Number of gaussians: vertices, or indices if the primitive has any.
+        num_rows: Number of vertices.
         degree: Degree of their spherical harmonics.
         antialiased: As in `Declared`.
         notes: As in `Declared`.
@@ -98,7 +102,7 @@ class Primitive:
             self.count = count_of(document.item("accessors", node.field("indices")))
 
     def read(self) -> Gaussians:
-        """The gaussians, in the space of the mesh."""
+        """Return the gaussians, in the coordinates of the mesh."""
         if self._packed is None:
             gaussians = self._read_attributes()
         else:
@@ -113,7 +117,7 @@ class Primitive:
 
     @property
     def packed_bytes(self) -> int:
-        """Bytes of `.spz` that reading expands."""
+        """Size of the embedded `.spz` in bytes; 0 without one."""
         if self._packed is None:
             return 0
         return len(self._packed.content)
@@ -140,7 +144,7 @@ class Primitive:
         return _Packed(content, header)
 
     def _size(self) -> tuple[int, int]:
-        """Number of vertices, and the SH degree."""
+        """Return the number of vertices, and the SH degree."""
         position = None
         if self._packed is None or self._attributes.has("POSITION"):
             position = self._document.item("accessors", self._attributes.field("POSITION"))
@@ -155,7 +159,8 @@ class Primitive:
         return header.num_gaussians, header.sh_degree
 
     def _check_plain(self) -> None:
-        """Raise ValueError where numbers are left to an extension that is not read."""
+        """Raise ValueError if the data of an attribute is in an extension that this
+        reader does not support."""
         holders = [holder for holder in (self._node, self._extension) if holder.has("extensions")]
         names = [name for holder in holders for name in _unread(holder.field("extensions"))]
         if not names:
@@ -163,18 +168,21 @@ class Primitive:
         for number in self._attributes.some_fields(()).values():
             if not has_data(self._document.item("accessors", number)):
                 name = name_text(names[0])
-                raise number.problem(f"expected numbers, got those of {name}, which is not read")
+                raise number.problem(
+                    f"expected data in a buffer, got data in {name}, which this reader does not "
+                    "support"
+                )
 
     def _degree(self) -> int:
-        """The SH degree, by the names of attributes."""
+        """Return the SH degree, which follows from the names of attributes."""
         for degree in (3, 2, 1):
             if self._find(f"SH_DEGREE_{degree}_COEF_0") is not None:
                 return degree
         return 0
 
     def _find(self, name: str) -> Node | None:
-        """The number of the accessor of an attribute, by its name or that of a
-        draft."""
+        """Return the index of the accessor of an attribute, by its released name or
+        that of a draft; None if it is missing."""
         for prefix in _PREFIXES:
             if self._attributes.has(prefix + name):
                 return self._attributes.field(prefix + name)
@@ -183,7 +191,7 @@ class Primitive:
     def _column(self, name: str, width: int) -> Callable[[slice], Floats]:
         number = self._find(name)
         if number is None:
-            number = self._attributes.field(_PREFIXES[0] + name)  # raises
+            number = self._attributes.field(_PREFIXES[0] + name)  # raises an error
         accessor = self._document.item("accessors", number)
         return column(self._document, accessor, self.num_rows, [width])
 
@@ -198,8 +206,14 @@ class Primitive:
 
         def decode(rows: slice) -> tuple[Floats, ...]:
             widths = scale(rows)
-            advice = "drafts of the extension had their logs; write the file with a newer program"
-            check(document.path, not (widths < 0).any(), f"scales of 0 or more, got less; {advice}")
+            advice = (
+                "drafts of the extension stored logarithms; write the file with a newer program"
+            )
+            check(
+                document.path,
+                not (widths < 0).any(),
+                f"scales of at least 0, got negative ones; {advice}",
+            )
             bands = [color(rows), *(coefficient(rows) for coefficient in higher)]
             return (
                 mean(rows),
@@ -212,9 +226,11 @@ class Primitive:
         return assemble(self.num_rows, self.degree, decode)
 
     def _color_and_opacity(self) -> tuple[Callable[[slice], Floats], Callable[[slice], Floats]]:
-        """Columns of the coefficient of degree 0, (N, 3), and of the opacity, (N,).
+        """Return functions for the SH coefficient of degree 0, (N, 3), and for the
+        opacity, (N,).
 
-        Drafts have both as COLOR_0: half more than the basis times the coefficient.
+        Drafts store both in COLOR_0, whose colour is 0.5 plus the coefficient times
+        SH_C0.
         """
         name = "SH_DEGREE_0_COEF_0"
         has_color = self._find(name) is not None
@@ -238,7 +254,8 @@ class Primitive:
         return color, lambda rows: scalar(rows)[:, 0]
 
     def _antialiased(self) -> bool | None:
-        """What the `.spz` says, or the extras that `v3dg.write_asset` writes."""
+        """Return what the `.spz`, or the extras that `v3dg.write_asset` writes, declare
+        about antialiasing."""
         if self._packed is not None:
             return self._packed.header.antialiased
         if self._extension.has("extras"):
@@ -248,7 +265,7 @@ class Primitive:
         return None
 
     def _notes(self) -> list[str]:
-        """What is declared and not done, a sentence each."""
+        """Return a sentence for each property that is ignored or converted."""
         notes = []
         for name, node in self._extension.some_fields(()).items():
             values = _PROPERTIES.get(name)
@@ -278,7 +295,8 @@ class Primitive:
         return notes
 
     def _attribute_notes(self) -> list[str]:
-        read = {"POSITION", "COLOR_0"}  # with the released names, COLOR_0 is for other programs
+        # Files with the released names may also have COLOR_0, for other programs.
+        read = {"POSITION", "COLOR_0"}
         for prefix in _PREFIXES:
             read |= {prefix + name for name in ("SCALE", "ROTATION", "OPACITY", *coefficients(3))}
         unread = [name for name in self._attributes.some_fields(()) if name not in read]
@@ -290,8 +308,8 @@ def _unread(extensions: Node) -> list[str]:
 
 
 def _encoded(gaussians: Gaussians) -> Gaussians:
-    """Gaussians whose colours are encoded as in sRGB, from linear ones: the harmonics
-    that are nearest in directions all around."""
+    """Return gaussians whose linear colours are converted to sRGB. Spherical harmonics
+    are fitted to the converted colours in directions all around."""
     bases = _core.sh_bases(gaussians.sh_degree, _directions())
     inverse = np.linalg.pinv(bases)
 
@@ -310,7 +328,7 @@ def _encoded(gaussians: Gaussians) -> Gaussians:
 
 
 def _directions() -> Floats:
-    """Unit vectors (D, 3), evenly around: a Fibonacci lattice."""
+    """Return (D, 3) unit vectors that are evenly distributed: a Fibonacci lattice."""
     steps = np.arange(_NUM_DIRECTIONS)
     z = 1 - (2 * steps + 1) / _NUM_DIRECTIONS
     angles = steps * np.pi * (3 - np.sqrt(5))
@@ -319,6 +337,6 @@ def _directions() -> Floats:
 
 
 def _srgb_from_linear(colors: Floats) -> Floats:
-    """The transfer function of sRGB (IEC 61966-2-1); negative light is black."""
+    """Return linear colours in sRGB (IEC 61966-2-1); negative values become black."""
     light = np.maximum(colors, 0.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

@@ -1,4 +1,4 @@
-"""All gaussians of a glTF file's scene: which primitives they are, and where."""
+"""All gaussians of a glTF file's scene, in the coordinates of the scene."""
 
 from v3dg._json import Node
 from v3dg.formats._gltf_document import Document, name_text
@@ -7,7 +7,7 @@ from v3dg.formats._gltf_primitives import NAME, READ_EXTENSIONS, Primitive, is_g
 from v3dg.formats._reading import check
 from v3dg.gaussians import Gaussians, common, empty, put
 
-# Extensions of what is not read anyway: surfaces, their textures, and lights.
+# Extensions of content that is ignored in any case: surfaces, textures and lights.
 _OTHER_EXTENSIONS = (
     "EXT_lights_",
     "EXT_texture_",
@@ -19,12 +19,13 @@ _MOST_NOTES = 20
 
 
 class Scene:
-    """The gaussians of a scene, of which nothing but their numbers is read at first.
+    """The gaussians of a scene. Until `read` is called, only their numbers are read.
 
     Attributes:
-        count: Number of gaussians, each as often as nodes place it.
+        count: Number of gaussians in the scene; a mesh counts once for each node that
+            places it.
         degree: The highest SH degree of a primitive.
-        antialiased: As in `Declared`, if it is the same for all.
+        antialiased: As in `Declared`; None if primitives differ.
         notes: As in `Declared`.
     """
 
@@ -33,7 +34,7 @@ class Scene:
         self.notes = _extension_notes(document)
         self._placements, notes = placements(document)
         self.notes += notes
-        self._primitives: dict[int, list[Primitive]] = {}  # by mesh
+        self._primitives: dict[int, list[Primitive]] = {}  # by the index of the mesh
         for placement in self._placements:
             if placement.mesh not in self._primitives:
                 self._primitives[placement.mesh] = self._primitives_of(placement.mesh)
@@ -51,13 +52,14 @@ class Scene:
         self.notes = list(dict.fromkeys(self.notes))
         if len(self.notes) > _MOST_NOTES:
             count = len(self.notes) - _MOST_NOTES
-            self.notes[_MOST_NOTES:] = [f"There are {count} more of such notes."]
+            self.notes[_MOST_NOTES:] = [f"{count} more notes are omitted."]
         self._check_claims()
 
     def read(self) -> Gaussians:
-        """The gaussians, in the order of nodes and primitives."""
+        """Return the gaussians, in the order of nodes and primitives."""
         gaussians = empty(self.count, self.degree)
-        uses: dict[int, list[tuple[Placement, int]]] = {}  # of a mesh, with its first row
+        # Placements of each mesh, with the first row.
+        uses: dict[int, list[tuple[Placement, int]]] = {}
         row = 0
         for placement in self._placements:
             uses.setdefault(placement.mesh, []).append((placement, row))
@@ -65,7 +67,8 @@ class Scene:
         for mesh, places in uses.items():
             offset = 0
             for primitive in self._primitives[mesh]:
-                part = primitive.read()  # once, and one after another
+                # Each primitive is read once, and freed before the next.
+                part = primitive.read()
                 for placement, first in places:
                     put(placed(part, placement), gaussians, first + offset)
                 offset += primitive.count
@@ -80,34 +83,40 @@ class Scene:
         ]
 
     def _check_claims(self) -> None:
-        """Raise ValueError unless the file may have so many gaussians, and expand so
-        much."""
+        """Raise ValueError if the file is too small for its number of gaussians or for
+        the expanded size of its data."""
         path = self._document.path
         claims = self._document.claims
         self._document.claim_buffers()
         primitives = [primitive for mesh in self._primitives.values() for primitive in mesh]
         claims.add(path, self.count)
         claims.add(path, sum(max(0, part.num_rows - part.count) for part in primitives))
-        # Limited, so that many primitives cannot share one large stream.
+        # Bounded so that many primitives cannot share one large stream.
         num_packed = sum(primitive.packed_bytes for primitive in primitives)
         limit = claims.num_bytes
-        check(path, num_packed <= limit, f"{limit} bytes of .spz, got {num_packed}")
+        check(
+            path,
+            num_packed <= limit,
+            f"at most {limit} bytes of .spz in a file of that size, got {num_packed}",
+        )
 
     def _elsewhere(self) -> str:
-        """The end of a message about a scene without gaussians."""
+        """Return the end of a message about a scene without gaussians."""
         unused = self._unused_meshes()
         if unused:
             return f" in the scene that is shown; {len(unused)} meshes outside of it have some"
-        return "; meshes are not read"
+        return "; surfaces cannot be read"
 
     def _left_out(self) -> list[str]:
         count = len(self._unused_meshes())
         if not count:
             return []
-        return [f"{count} meshes with gaussians that no node of the scene has are left out."]
+        return [
+            (f"{count} meshes with gaussians are ignored, because no node of the scene has them.")
+        ]
 
     def _unused_meshes(self) -> list[int]:
-        """Meshes with gaussians that the scene does not have."""
+        """Return the meshes with gaussians that no node of the scene has."""
         document = self._document
         return [
             mesh
@@ -121,11 +130,11 @@ def _has_gaussians(mesh: Node) -> bool:
 
 
 def _extension_notes(document: Document) -> list[str]:
-    """Sentences about what is not read; ValueError names an extension that is required
-    and not read."""
+    """Return notes about ignored content; raise ValueError for a required extension
+    that this reader does not support."""
     for name, node in _extensions(document, "extensionsRequired"):
         if name not in READ_EXTENSIONS and not name.startswith(_OTHER_EXTENSIONS):
-            text = f"expected extensions that are read, got {name_text(name)}"
+            text = f"expected required extensions that this reader supports, got {name_text(name)}"
             raise node.problem(f"{text}; write the file without it")
     notes = [
         f"The extension {name_text(name)} is not read."
@@ -133,12 +142,12 @@ def _extension_notes(document: Document) -> list[str]:
         if name not in READ_EXTENSIONS and not name.startswith(_OTHER_EXTENSIONS)
     ]
     if document.array("animations"):
-        notes.append("Animations are not read: nodes are where they are at rest.")
+        notes.append("Animations are not read: nodes keep their rest poses.")
     return notes
 
 
 def _extensions(document: Document, kind: str) -> list[tuple[str, Node]]:
-    """Names of extensions, with their places."""
+    """Return the extensions in a list of the root, with the place of each name."""
     if not document.root.has(kind):
         return []
     names = document.root.field(kind)

@@ -1,5 +1,5 @@
-"""Measures what gaussians lose in a packed file: the values that are cut to the range
-of its format, and the rounding errors of the others."""
+"""Measures the losses of gaussians that are written to a quantised format: clipped
+values, and rounding errors of the others."""
 
 import math
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ from v3dg.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Losses:
-    """The losses of gaussians in a packed file.
+    """The losses of gaussians that were written to a file of a quantised format.
 
     Attributes:
-        cut: Number of values that were cut to the range of the format, by kind:
+        cut: Number of values that were clipped to the range of the format, by kind:
             `scales`, `colors` of degree 0, `harmonics` of higher degrees, and
-            `opacities` that no pixel shows and that became 0. Kinds without any are
-            left out.
+            `opacities` too small to be visible, which became 0. Kinds without clipped
+            values are missing.
         position_error: Largest error of a coordinate, relative to the diameter of the
-            ball of most gaussians.
-        scale_error: Largest error of a scale that was not cut, relative to it.
-        color_error: Largest error of a colour of degree 0 that was not cut, where 1 is
-            from black to white.
-        harmonics_error: Largest error of a coefficient of higher harmonics that was not
-            cut.
+            ball that contains most gaussians.
+        scale_error: Largest relative error of a scale that was not clipped.
+        color_error: Largest error of a colour of degree 0 that was not clipped; 1 is
+            the difference between black and white.
+        harmonics_error: Largest error of a coefficient of a higher degree that was not
+            clipped.
         limits: The range of the format.
     """
 
@@ -41,7 +41,7 @@ class Losses:
 
     @property
     def lines(self) -> list[str]:
-        """What was lost, in words."""
+        """The losses as sentences for users."""
         lines = []
         if self.cut:
             counts = ", ".join(f"{count:,} {self._kind(kind)}" for kind, count in self.cut.items())
@@ -76,7 +76,7 @@ class Losses:
 
 
 def losses(written: Gaussians, read: Gaussians, limits: Limits) -> Losses:
-    """Compare gaussians on the host with those that a packed file gives back, in the
+    """Compare gaussians on the host with those that a quantised file contains, in the
     same order and axes."""
     higher = written.sh[:, 1:]
     logs = log_scales(written.scales)

@@ -18,25 +18,27 @@ Integers: TypeAlias = NDArray[np.integer]
 
 SQRT2 = math.sqrt(2.0)
 SH_C0 = _core.sh_base0
-"""The basis function of degree 0: colour is SH_C0 times its coefficient, plus ½."""
+"""The basis function of SH degree 0: a colour is 0.5 plus SH_C0 times its
+coefficient."""
 
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
-"""SH degree by the number of coefficients a channel past the first."""
+"""The SH degree for each number of coefficients per channel after the first."""
 
-# Gaussians decoded at once: a block fits into the cache in double precision.
+# Gaussians that are decoded together: a block of doubles fits into the cache.
 _BLOCK = 1 << 16
-_MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
+# 2e-9: replaces scales of 0, whose logarithm no quantised format can store.
+_MIN_LOG_SCALE = -20.0
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The ranges of values in a quantised format; values outside of them are cut.
+    """The ranges of values in a quantised format; other values are clipped.
 
     Attributes:
-        log_scale: Lowest and highest log of a scale.
-        color: Lowest and highest coefficient of degree 0.
-        harmonic: Lowest and highest coefficient of higher degrees.
+        log_scale: Minimum and maximum logarithm of a scale.
+        color: Minimum and maximum SH coefficient of degree 0.
+        harmonic: Minimum and maximum SH coefficient of higher degrees.
     """
 
     log_scale: tuple[float, float] = (_MIN_LOG_SCALE, math.inf)
@@ -44,8 +46,8 @@ class Limits:
     harmonic: tuple[float, float] = (-math.inf, math.inf)
 
 
-# The components of a quaternion that are stored, in ascending order, by the one that is
-# omitted.
+# For the index of the omitted component of a quaternion: the indices of the stored
+# ones.
 _STORED_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
@@ -55,10 +57,11 @@ def blocks(count: int) -> Iterator[slice]:
 
 
 def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ...]]) -> Gaussians:
-    """Decode gaussians by blocks: ``decode`` returns means, quats, scales, opacities
-    and sh of one."""
+    """Decode gaussians in blocks. ``decode`` returns the means, quats, scales,
+    opacities and sh of the gaussians in a slice."""
     gaussians = empty(count, degree)
-    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are passed on
+    # Infinities and NaN are passed on.
+    with np.errstate(over="ignore", invalid="ignore"):
         for block in blocks(count):
             for array, values in zip(vars(gaussians).values(), decode(block), strict=True):
                 array[block] = values
@@ -66,8 +69,8 @@ def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ..
 
 
 def quats_from_three(three: Floats, omitted: Integers) -> Floats:
-    """Return unit quaternions (N, 4) from three components and the index of the omitted
-    one, which is >= 0."""
+    """Return unit quaternions (N, 4), given three components and the index of the
+    omitted component, which is not negative."""
     omitted_component = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
     quats = np.empty((len(three), 4))
     np.put_along_axis(quats, _STORED_COMPONENTS[omitted], three, axis=1)
@@ -76,8 +79,9 @@ def quats_from_three(three: Floats, omitted: Integers) -> Floats:
 
 
 def three_of_quats(quats: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the inverse of `quats_from_three`: three components (N, 3) within ±√½, and
-    the index (N,) of the largest component, which is omitted."""
+    """Return the arguments of `quats_from_three` for some quaternions: three components
+    (N, 3), within ±√½, and the index (N,) of the largest component, which is
+    omitted."""
     unit = normalised(quats)
     largest = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -91,33 +95,37 @@ def log_scales(scales: Floats) -> Floats:
 
 
 def to_integers(values: Floats, largest: int) -> NDArray[np.uint32]:
-    """Return the nearest whole numbers within 0 to ``largest``."""
+    """Return the nearest integers between 0 and ``largest``."""
     return np.clip(np.rint(values), 0, largest).astype(np.uint32)
 
 
 def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
-    """Return the nearest of 255 steps of opacities, but 0 for those that are invisible:
-    if they were rounded up, they would be visible."""
+    """Return opacities as bytes, where 255 is opaque. Invisible opacities become 0:
+    rounded up, they would be visible."""
     return np.where(opacities < _LEAST_VISIBLE_OPACITY, 0, to_integers(opacities * 255.0, 255))
 
 
 def file_order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """The order (N,) of a format that keeps that of the gaussians."""
+    """Return the order (N,) for a format that keeps the order of the gaussians."""
     return np.arange(len(gaussians))
 
 
 def curve_order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """The order (N,) along a Morton curve, so that neighbours follow one another."""
+    """Return the order (N,) along a Morton curve, in which neighbours in space are
+    close."""
     return _core.morton_order(gaussians.means)
 
 
 def check_writable(gaussians: Gaussians) -> Gaussians:
-    """Return the gaussians on the host; the ValueError names the first value that a
-    quantised format cannot hold."""
+    """Return the gaussians on the host; raise a ValueError that names the first value
+    that a quantised format cannot store."""
     host = gaussians.numpy()
     for name, values in vars(host).items():
         check_all(
-            name, values, np.isfinite(values), "finite values (v3dg.cleaning.examine finds others)"
+            name,
+            values,
+            np.isfinite(values),
+            ("finite values (v3dg.cleaning.examine reports all others)"),
         )
     check_all("quats", host.quats, (host.quats != 0).any(axis=1), "a length above 0")
     check_all("scales", host.scales, host.scales >= 0, "values >= 0")

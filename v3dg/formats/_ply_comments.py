@@ -1,9 +1,10 @@
-"""What the comments of a `.ply` declare: whether trainers antialiased, and what is up.
+"""Reads and writes comments of a `.ply` that declare antialiasing and the axis that
+points up.
 
-Brush and splat-transform write `SplatRenderMode: default`, `mip` or `2dgs`, Postshot
-`postshot.anti_aliasing=0` or `1`, and programs that follow it `antialiased 0` or `1`.
-The last of them counts, whatever its case, as in Brush and splat-transform. nerfstudio
-writes `Vertical Axis: z`.
+Brush and splat-transform write `SplatRenderMode: default`, `mip` or `2dgs`. Postshot
+writes `postshot.anti_aliasing=0` or `1`, and some other programs `antialiased 0` or
+`1`. As in Brush and splat-transform, case is ignored and the last of these comments
+counts. nerfstudio writes `Vertical Axis: z`.
 """
 
 import re
@@ -19,7 +20,7 @@ _MODES: dict[str, bool | None] = {"default": False, "mip": True, "2dgs": None}
 
 
 def declared_by(comments: Iterable[str]) -> Declared:
-    """What comments declare, without the word `comment`."""
+    """Return what comments declare; the word `comment` has been removed from them."""
     antialiased = None
     up: Axis | None = None
     notes = []
@@ -50,7 +51,8 @@ def _axis_named(name: str) -> Axis | None:
 
 
 def comments_for(antialiased: bool | None) -> list[str]:  # noqa: FBT001
-    """The comments of a file that declares whether trainers antialiased."""
+    """Return the comments of a file that declares whether its gaussians are
+    antialiased."""
     if antialiased is None:
         return []
     mode = "default"

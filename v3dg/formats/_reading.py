@@ -1,5 +1,5 @@
-"""Shared code of the readers of untrusted files: assets that are read in parts, and
-bounds on memory."""
+"""Code that readers of untrusted files share: assets that are read in parts, and limits
+on memory."""
 
 import contextlib
 import os
@@ -20,9 +20,9 @@ from v3dg._numbers import check as check
 from v3dg.formats._declared import NOTHING, Declared
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
-_FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim this many
-_MAX_NAMES = 8  # in a message
-_FREE_BYTES = 1 << 20  # a member of a zip may have this size, whatever the size of the zip
+_FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim to have this many
+_MAX_NAMES = 8  # names that a message lists
+_FREE_BYTES = 1 << 20  # a member of a zip may be this large, for any size of the zip
 
 
 AnyPath: TypeAlias = str | os.PathLike[str]
@@ -35,11 +35,11 @@ class AssetFile:
     until this object is dropped.
 
     Attributes:
-        read: Function from a first and a last row to these gaussians; reading in file
-            order is quickest. Its errors are those of `read_asset`.
-        whole_bytes: Memory that the first read takes and keeps, if the format can only
-            be read whole.
-        declared: What the file declares beside the numbers of its gaussians.
+        read: Function that returns the gaussians from a first row up to an end row.
+            Reading in file order is fastest. It raises the errors of `read_asset`.
+        whole_bytes: Memory in bytes that the first read occupies until the file is
+            closed, if the format can only be read whole; else 0.
+        declared: What the file declares about its gaussians.
     """
 
     path: AnyPath
@@ -51,8 +51,8 @@ class AssetFile:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return names for a message: the first few, each shortened, and how many more
-    there are."""
+    """Return names as text for a message: the first few, shortened, and the number of
+    the others."""
     all_names = list(names)
     text = ", ".join(f"{name[:40]!a}" for name in all_names[:_MAX_NAMES])
     if len(all_names) > _MAX_NAMES:
@@ -61,7 +61,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def bytes_of(files: Iterable[AnyPath]) -> int:
-    """Return the total size on disk of those files that exist."""
+    """Return the total size in bytes of those files that exist."""
     return sum(os.stat(file).st_size for file in set(files) if os.path.exists(file))
 
 
@@ -73,10 +73,11 @@ def whole_file(
     files: Iterable[AnyPath] = (),
     declared: Declared = NOTHING,
 ) -> AssetFile:
-    """Return an asset file for a format that can only be read whole; the first read
-    caches all gaussians."""
+    """Return an asset file for a format that can only be read whole. The first read
+    keeps all gaussians in memory."""
     read_once = cache(lambda: read(path))
-    # While it is read: the content of the files, and at most twice the gaussians.
+    # The memory during the first read: the content of the files, and at most two copies
+    # of the gaussians.
     memory = bytes_of([path, *files]) + 2 * count * gaussian_bytes(sh_degree)
     return AssetFile(
         path,
@@ -89,8 +90,8 @@ def whole_file(
 
 
 class File:
-    """A file with random access, closed when it is dropped; ValueError if it is not a
-    regular file."""
+    """A file with random access, which is closed when this object is destroyed. A file
+    that is not a regular file is a ValueError."""
 
     def __init__(self, path: AnyPath) -> None:
         self.path = path
@@ -100,28 +101,30 @@ class File:
         self.num_bytes = os.fstat(self._descriptor).st_size
 
     def rows(self, dtype: np.dtype[_Scalar], offset: int, count: int) -> NDArray[_Scalar]:
-        """Read `count` records from an offset on; ValueError if the file has become
-        shorter."""
+        """Return `count` records from an offset on; raise ValueError if the file has
+        been truncated meanwhile."""
         rows = np.empty(count, dtype)
         with _files.naming_errors(self.path):
             is_whole = _files.read_at(self._descriptor, rows, offset)
         if not is_whole:
             name = os.fspath(self.path)
-            raise ValueError(f"{name}: the file became shorter while it was read; read it again")
+            raise ValueError(f"{name}: the file was truncated while it was read; read it again")
         return rows
 
 
 def least_bytes(count: int) -> int:
-    """Return the smallest size of a file that may claim `count` gaussians: one byte for
-    each beyond the first _FREE_GAUSSIANS."""
+    """Return the minimum size in bytes of a file with `count` gaussians: one byte for
+    each gaussian after the first _FREE_GAUSSIANS."""
     return max(0, count - _FREE_GAUSSIANS)
 
 
 class Claims:
-    """The files of an asset, and how many gaussians they claim to hold together."""
+    """The files of an asset and the number of gaussians that they claim to contain. It
+    rejects files that are too small for their number of gaussians."""
 
     def __init__(self) -> None:
-        self._files: dict[tuple[int, int], int] = {}  # bytes; a file may have several names
+        # Size in bytes by device and inode, as a file may have several names.
+        self._files: dict[tuple[int, int], int] = {}
         self._gaussians = 0
 
     @contextlib.contextmanager
@@ -137,26 +140,32 @@ class Claims:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes of all files together."""
+        """Total size of all files in bytes."""
         return sum(self._files.values())
 
     def add(self, path: AnyPath, count: int) -> None:
-        """Accept that a file has `count` gaussians, or raise ValueError. Call this
-        before allocating memory for them."""
+        """Accept that a file has `count` more gaussians, or raise ValueError if the
+        files are too small for all of them. Call this before allocating memory for the
+        gaussians."""
         self._gaussians += count
         num_bytes = self.num_bytes
         is_plausible = least_bytes(self._gaussians) <= num_bytes
         claim = f"{self._gaussians} gaussians in {num_bytes} bytes"
-        check(path, is_plausible, f"a byte a gaussian beyond {_FREE_GAUSSIANS}, got {claim}")
+        check(
+            path,
+            is_plausible,
+            f"at least one byte per gaussian after the first {_FREE_GAUSSIANS}, got {claim}; is "
+            "the file complete?",
+        )
 
 
 class Archive:
-    """A zip whose members are no larger than itself, or 1 MiB, and fit their
-    checksums."""
+    """A zip whose members have correct checksums and are no larger than the zip or 1
+    MiB."""
 
     def __init__(self, path: AnyPath, file: IO[bytes]) -> None:
         self._path = path
-        start = file.read(4)  # zipfile accepts a zip that begins anywhere in the file
+        start = file.read(4)  # zipfile accepts a zip that starts anywhere in a file
         check(path, start == b"PK\3\4", f"a zip, got a file that begins with {start!r}")
         with value_errors(path, "a zip that is not damaged"):
             self._zip = zipfile.ZipFile(file)
@@ -170,21 +179,26 @@ class Archive:
         check(
             self._path,
             size <= self._max_bytes,
-            f"{name!a} no larger than the zip, got {size} bytes",
+            f"{name!a} in the zip to be no larger than the zip, got {size} bytes",
         )
         is_readable = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-        check(self._path, is_readable, f"{name!a} stored or deflated in the zip, got neither")
-        if getattr(member, "CRC", None) == 0:  # torch writes no checksum if it is configured so
-            del member.CRC  # without the attribute, zipfile does not compare it
+        check(
+            self._path,
+            is_readable,
+            f"{name!a} in the zip to be stored or deflated, got another compression",
+        )
+        # Torch can be configured to write no checksums.
+        if getattr(member, "CRC", None) == 0:
+            del member.CRC  # zipfile does not compare a missing checksum
         with value_errors(self._path, "a zip that is not damaged"), self._zip.open(member) as file:
-            # Without a limit, zipfile expands everything before it truncates.
+            # Without a size, zipfile would decompress everything, however large it is.
             content = file.read(size)
         check(self._path, len(content) == size, f"{size} bytes in {name!a}, got {len(content)}")
         return content
 
 
 def integer_of(node: Node, expected: str, low: int, high: int) -> int:
-    """Return a JSON value that must be a whole number of ``low`` to ``high``."""
+    """Return a JSON value that must be an integer from ``low`` to ``high``."""
     if (
         not isinstance(node.value, int)
         or isinstance(node.value, bool)

@@ -1,13 +1,14 @@
 """Checkpoints of trainers, `.pt`, `.ckpt` and `.pth`: gsplat's `simple_trainer`,
 splatfacto of nerfstudio, and the code of the 3DGS paper and of 2DGS.
 
-All hold means, log scales, quaternions w x y z, logits of opacities and SH coefficients
-as tensors: gsplat in a dict `splats`, nerfstudio among the values of `pipeline`, the
-code of the papers in a tuple. What differs is in `_Layout`. The file is a zip of a
-pickle and of the numbers of each tensor. The pickle is followed as far as it builds
-dicts, plain values and tensors; nothing that it names is imported or called, and only
-the numbers of the gaussians are read. Of the settings of the run, which are beside it
-in YAML, single lines are.
+All of them store means, log scales, quaternions w x y z, opacity logits and SH
+coefficients as tensors: gsplat in a dict `splats`, nerfstudio among the values of
+`pipeline`, the code of the papers in a tuple. `_Layout` describes the differences.
+
+The file is a zip of a pickle and of the numbers of each tensor. Of the pickle, only
+operations that build dicts, plain values and tensors are followed: nothing is imported
+or called. Of the tensors, only those of the gaussians are read. The settings of a run
+are in a YAML file beside the checkpoint; single lines of that file are read.
 """
 
 import math
@@ -38,29 +39,38 @@ from v3dg.rotations import normalised
 
 _FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 _NERFSTUDIO = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-_NERFSTUDIO_PREFIXES = ("_model.gauss_params.", "_model.")  # the second before version 1.1
-# The indices of the tensors in the tuple of the papers' code, in the order of _FIELDS.
+# The second one is that of versions before 1.1.
+_NERFSTUDIO_PREFIXES = ("_model.gauss_params.", "_model.")
+# Indices into the tuple that the papers' code stores, in the order of _FIELDS.
 _CAPTURED = (1, 4, 5, 6, 2, 3)
-_MIN_CAPTURE = 12  # values of that tuple; variants add some
-# Members of a checkpoint that say nothing about its gaussians.
+_MIN_CAPTURE = 12  # length of that tuple; variants append more values
+# Members of a checkpoint that do not describe gaussians.
 _GSPLAT_MEMBERS = ("step", "splats", "optimizers", "schedulers", "strategy_state")
 _NERFSTUDIO_MEMBERS = ("device_indicator_param", "background_color", "lpips", "psnr", "ssim")
 _NOT_GAUSSIANS = {
-    "app_module": "The appearance of single photographs (app_module) was left out: "
-    "colours are those without it.",
-    "bil_grids": "The bilateral grids of single photographs were left out: "
-    "colours are those before them.",
-    "pose_adjust": "Cameras were moved in training (pose_adjust), so those of the data are "
-    "not exactly its cameras.",
-    "camera_optimizer": "Cameras were moved in training (camera_optimizer), so those of the "
-    "data are not exactly its cameras.",
+    "app_module": (
+        "The appearance model of single photographs (app_module) is ignored: colours are those "
+        "without it."
+    ),
+    "bil_grids": (
+        "The bilateral grids of single photographs are ignored: colours are those before the "
+        "grids are applied."
+    ),
+    "pose_adjust": (
+        "Training moved the cameras (pose_adjust), so those of the data set do not match exactly."
+    ),
+    "camera_optimizer": (
+        "Training moved the cameras (camera_optimizer), so those of the data set do not match "
+        "exactly."
+    ),
 }
 _NOT_GAUSSIANS["bilagrid"] = _NOT_GAUSSIANS["bil_grids"]
-_SETTINGS = ("cfg.yml", "config.yml")  # of gsplat, of nerfstudio
+_SETTINGS = ("cfg.yml", "config.yml")  # of gsplat and of nerfstudio
 _MAX_SETTINGS_BYTES = 1 << 20
-_MAX_PICKLE = 1 << 20  # bytes; trainers' have far less, and each byte can be an object
+# Bytes; trainers write far less, and each byte could create an object.
+_MAX_PICKLE = 1 << 20
 _MAX_DIMENSIONS = 8
-# Operations that push a plain value.
+# Operations that push a plain value on the stack.
 _VALUES = (
     "BININT",
     "BININT1",
@@ -78,8 +88,8 @@ _TYPES = {
     "HalfStorage": "<f2",
     "BFloat16Storage": "<u2",
 }
-# Modules whose names a trainer's pickle may contain. Others are refused, and none is
-# imported.
+# Modules whose names may occur in a trainer's pickle. Other names are errors, and no
+# module is imported.
 _ALLOWED_MODULES = (
     "numpy",
     "numpy.core.multiarray",
@@ -93,21 +103,21 @@ _ALLOWED_MODULES = (
 )
 
 
-# A value that a pickle builds: None, a number, text, a tuple, a dict, a _Named or a
-# _Tensor. `value_errors` turns the errors of operations on another kind into
-# ValueErrors.
+# A value that a pickle creates: None, a number, a text, a tuple, a dict, a _Named or a
+# _Tensor. Operations on a value of the wrong kind raise errors, which `value_errors`
+# converts to ValueError.
 _Value: TypeAlias = Any
 _Numbers: TypeAlias = NDArray[np.number]
 
 
 class _Named(NamedTuple):
-    """Placeholder for a class, a function, or the result of calling one."""
+    """Placeholder for a class, for a function, or for the result of a call."""
 
     name: str
 
 
 class _Tensor(NamedTuple):
-    kind: str  # kind of its storage
+    kind: str  # the type of the numbers in its storage
     key: str
     num_stored: int
     offset: int
@@ -116,12 +126,12 @@ class _Tensor(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """The places and the encoding of the gaussians in a checkpoint.
+    """The tensors of the gaussians in a checkpoint, and their encoding.
 
     Attributes:
-        fields: The tensors by the names that gsplat has for them. Without `shN`, `sh0`
-            has logits of colours without view dependence.
-        notes: Sentences about the other content of the checkpoint.
+        fields: The tensors, by their names in gsplat. If `shN` is missing, `sh0`
+            contains logits of colours without view dependence.
+        notes: Sentences about other content of the checkpoint.
     """
 
     fields: dict[str, _Tensor]
@@ -133,14 +143,15 @@ class _Layout(NamedTuple):
 
     @property
     def num_scales(self) -> int:
-        """Stored scales a gaussian: 2 for 2DGS, whose gaussians are flat."""
+        """Number of stored scales per gaussian: 2 for 2DGS, whose gaussians are
+        flat."""
         if self.fields["scales"].shape[1:] == (2,):
             return 2
         return 3
 
 
 class _Settings(NamedTuple):
-    """The settings of a run that concern its gaussians."""
+    """The settings of a training run that affect its gaussians."""
 
     antialiased: bool | None = None
     is_flat: bool = False
@@ -148,7 +159,7 @@ class _Settings(NamedTuple):
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a checkpoint; the gaussians are all read with the first rows."""
+    """Open a checkpoint. The first read loads all gaussians."""
     claims = Claims()
     with claims.open(path) as file:
         layout = _layout_of(path, Archive(path, file))[0]
@@ -212,8 +223,8 @@ def _sigmoid(logits: Floats) -> Floats:
 
 
 def _layout_of(path: AnyPath, archive: Archive) -> tuple[_Layout, str]:
-    """Return where the gaussians are, and the folder of the zip that holds their
-    numbers."""
+    """Return the layout of the gaussians, and the folder of the zip that contains the
+    tensors."""
     root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
     pickle = archive.read(f"{root}data.pkl")
     check(
@@ -231,7 +242,8 @@ def _layout_of(path: AnyPath, archive: Archive) -> tuple[_Layout, str]:
 
 
 def _size(path: AnyPath, layout: _Layout, claims: Claims) -> tuple[int, int]:
-    """Return the number of gaussians, and of higher SH coefficients per channel."""
+    """Return the number of gaussians, and the number of higher SH coefficients per
+    channel."""
     count = layout.fields["means"].shape[0]
     claims.add(path, count)
     if layout.has_logits:
@@ -243,8 +255,8 @@ def _size(path: AnyPath, layout: _Layout, claims: Claims) -> tuple[int, int]:
 
 
 def _settings_of(path: AnyPath) -> _Settings:
-    """Return the settings from a file beside a checkpoint or in the folder above; empty
-    ones if there is no such file."""
+    """Return the settings of the run from a file in the folder of the checkpoint or the
+    folder above; defaults if there is no such file."""
     folder = Path(path).absolute().parent
     files = [place / name for place in (folder, folder.parent) for name in _SETTINGS]
     file = next((file for file in files if file.is_file()), None)
@@ -253,12 +265,14 @@ def _settings_of(path: AnyPath) -> _Settings:
     with Claims().open(file) as opened:
         content = opened.read(_MAX_SETTINGS_BYTES + 1)
     if len(content) > _MAX_SETTINGS_BYTES:
-        note = f"{file.name} is too large to be that of a run and was not read."
+        note = f"{file.name} is too large for the settings of a run and was ignored."
         return _Settings(notes=(note,))
-    # YAML with Python objects, of which lines of a name and a plain value are read.
+    # The YAML may contain Python objects, so only lines with a name and a plain value
+    # are read.
     pattern = r"^[ ]*(\w+): +'?([\w.+-]+)'?[ ]*\r?$"
     if file.name == _SETTINGS[0]:
-        pattern = pattern.replace("[ ]*", "", 1)  # those of the run, not of an object in it
+        # Only unindented lines are settings of the run itself.
+        pattern = pattern.replace("[ ]*", "", 1)
     text = content.decode("utf-8", errors="replace")
     values: dict[str, str] = {}
     for name, value in re.findall(pattern, text, re.MULTILINE):
@@ -275,8 +289,8 @@ def _settings(values: Mapping[str, str]) -> _Settings:
     notes = []
     if values.get("with_eval3d") == "true":
         notes.append(
-            "Gaussians were trained to be evaluated along rays (with_eval3d), so pictures of "
-            "their projections differ."
+            "Gaussians were trained to be evaluated along rays (with_eval3d), so pictures that "
+            "project them differ."
         )
     return _Settings(antialiased, values.get("model_type", "").startswith("2dgs"), tuple(notes))
 
@@ -288,8 +302,8 @@ def _doubles(values: _Numbers) -> Floats:
 
 
 def _layout(path: AnyPath, content: _Value) -> _Layout:
-    """Return where the gaussians are in the pickled object; ValueError if a part is
-    missing."""
+    """Return the layout of the gaussians in the pickled object; raise ValueError if a
+    part is missing."""
     members: dict[str, _Value] = {}
     if isinstance(content, dict):
         members = content
@@ -306,7 +320,11 @@ def _layout(path: AnyPath, content: _Value) -> _Layout:
         refuse(path, f"{expected}, got {listed(members) or 'none'}")
     captured = content[0]
     has_fields = len(captured) >= _MIN_CAPTURE
-    check(path, has_fields, f"{_MIN_CAPTURE} captured values, got {len(captured)}")
+    check(
+        path,
+        has_fields,
+        f"at least {_MIN_CAPTURE} values in the tuple of the 3DGS code, got {len(captured)}",
+    )
     values = dict(zip(_FIELDS, (captured[i] for i in _CAPTURED), strict=True))
     return _Layout(_tensors(path, values))
 
@@ -322,7 +340,7 @@ def _gsplat_layout(path: AnyPath, splats: dict[str, _Value], notes: tuple[str, .
         )
     unread = [name for name in splats if name not in used]
     if unread:
-        notes += (f"Tensors of splats were left out: {listed(unread)}.",)
+        notes += (f"Tensors of splats were ignored: {listed(unread)}.",)
     return _Layout(_tensors(path, values), notes)
 
 
@@ -342,19 +360,19 @@ def _nerfstudio_layout(path: AnyPath, pipeline: dict[str, _Value]) -> _Layout:
     notes = _left_out(unread)
     tensors = _tensors(path, values)
     if math.prod(tensors["shN"].shape) == 0 and tensors["means"].shape[0] > 0:
-        # For SH degree 0, splatfacto stores logits of colours.
+        # With SH degree 0, splatfacto stores logits of colours.
         del tensors["shN"]
     return _Layout(tensors, notes)
 
 
 def _left_out(members: Iterable[str]) -> tuple[str, ...]:
-    """Return a sentence for each unread member that is known to change the picture, and
-    one for all others."""
+    """Return a sentence for each ignored member that is known to change the picture,
+    and one sentence for all other ignored members."""
     names = list(members)
     notes = [_NOT_GAUSSIANS[name] for name in names if name in _NOT_GAUSSIANS]
     unknown = [name for name in names if name not in _NOT_GAUSSIANS]
     if unknown:
-        notes.append(f"Parts of the checkpoint were left out: {listed(unknown)}.")
+        notes.append(f"Parts of the checkpoint were ignored: {listed(unknown)}.")
     return tuple(notes)
 
 
@@ -365,13 +383,13 @@ def _tensors(path: AnyPath, values: Mapping[str, _Value]) -> dict[str, _Tensor]:
             kind = type(value).__name__
             if isinstance(value, _Named):
                 kind = f"{value.name!a}"
-            refuse(path, f"a tensor of floats {name} in the checkpoint, got {kind}")
+            refuse(path, f"{name} in the checkpoint to be a tensor of floats, got {kind}")
         tensors[name] = value
     return tensors
 
 
 def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: str) -> _Numbers:
-    """Return the numbers of a tensor; ValueError unless the file stores each of
+    """Return the numbers of a tensor; raise ValueError unless the file contains all of
     them."""
     steps = zip(tensor.shape, tensor.strides, strict=True)
     last = tensor.offset + sum((size - 1) * step for size, step in steps)
@@ -379,7 +397,12 @@ def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: st
     stored_count = tensor.num_stored
     is_inside = count <= stored_count and (not count or last < stored_count)
     layout = (tensor.offset, tensor.shape, tensor.strides)
-    check(path, is_inside, f"{name} within the {stored_count} numbers of its storage, got {layout}")
+    check(
+        path,
+        is_inside,
+        f"{name} within the {stored_count} numbers of its storage, got offset, shape and strides "
+        f"{layout}",
+    )
     dtype: np.dtype[np.number] = np.dtype(_TYPES[tensor.kind])
     content = archive.read(f"{root}data/{tensor.key}")
     size = stored_count * dtype.itemsize
@@ -390,11 +413,11 @@ def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: st
 
 
 class _Unpickler:
-    """Builds what torch.save pickled: values of lists are dropped, and dict entries
-    whose key is not text.
+    """Builds the object that torch.save pickled, without the values of lists and
+    without dict entries whose key is not text.
 
-    Each operation is one of a few on a stack, so time and memory are in proportion to
-    the pickle.
+    Only a few stack operations are allowed, so time and memory are proportional to the
+    size of the pickle.
     """
 
     def __init__(self) -> None:
@@ -403,7 +426,7 @@ class _Unpickler:
         self._memo: dict[int, _Value] = {}
 
     def run(self, pickle: bytes) -> _Value:
-        """Return the object that a pickle holds; ValueError for an operation or a name
+        """Return the object in a pickle; raise ValueError for an operation or a name
         that is not allowed."""
         for opcode, argument, _ in pickletools.genops(pickle):
             if opcode.name == "STOP":
@@ -414,11 +437,12 @@ class _Unpickler:
         return self._stack.pop()
 
     def _push(self, operation: str, argument: _Value) -> bool:
-        """Apply an operation that leaves the values on the stack as they are; whether
-        it is one."""
+        """Apply an operation that only adds to the stack; return whether `operation` is
+        one of these."""
         match operation:
             case "PROTO" | "BINPERSID":
-                pass  # the tuple that names a storage stands for the storage
+                # The tuple that describes a storage is used in place of the storage.
+                pass
             case "MARK":
                 self._marks.append(len(self._stack))
             case "EMPTY_DICT":
@@ -438,7 +462,8 @@ class _Unpickler:
         return True
 
     def _combine(self, operation: str) -> bool:
-        """Apply an operation that takes values from the stack; whether it is one."""
+        """Apply an operation that takes values from the stack; return whether
+        `operation` is one of these."""
         match operation:
             case "TUPLE":
                 self._stack.append(tuple(self._above_mark()))
@@ -473,8 +498,8 @@ class _Unpickler:
 
 
 def _allowed_name(argument: str) -> _Named:
-    """Return the "module name" of a class or function; ValueError unless its module is
-    allowed."""
+    """Return the placeholder for a class or a function, given "module name"; raise
+    ValueError if the module is not allowed."""
     module, _, name = argument.partition(" ")
     short = f"{module[:60]}.{name[:60]}"
     if module not in _ALLOWED_MODULES:
@@ -483,7 +508,7 @@ def _allowed_name(argument: str) -> _Named:
 
 
 def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
-    """Return what stands for the result of a call; nothing is called."""
+    """Return a placeholder for the result of a call; nothing is called."""
     if name.startswith("collections."):
         return {}
     if name == "torch._utils._rebuild_parameter":
@@ -492,8 +517,8 @@ def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
         return _Named(name)
     (_, storage, key, _, num_stored), offset, shape, strides = arguments[:4]
     kind = storage.name.removeprefix("torch.")
-    # Only as many numbers as a tensor may have dimensions: many calls can share a long
-    # tuple.
+    # Limited to the number of dimensions that a tensor may have, because many calls can
+    # share a long tuple.
     numbers = (num_stored, offset, *shape[:_MAX_DIMENSIONS], *strides[:_MAX_DIMENSIONS])
     is_plain = all(type(number) is int and 0 <= number < 1 << 48 for number in numbers)
     if (

@@ -1,11 +1,12 @@
-"""`.compressed.ply`, of PlayCanvas and SuperSplat: 16 bytes a gaussian, within the
-ranges of chunks of 256.
+"""`.compressed.ply`, of PlayCanvas and SuperSplat: 16 bytes per gaussian, relative to
+the ranges of chunks of 256 gaussians.
 
-Element `chunk` holds the lowest and highest position, log scale and colour of its
-gaussians as floats, element `vertex` a position and a scale (11, 10 and 11 bits of that
-range), a quaternion (index of its largest component, 10 bits each for the others),
-colour and opacity (8 bits each), and element `sh` a byte a coefficient, channel by
-channel, for -4 to 4. See docs/formats.md.
+Element `chunk` has the minimum and maximum position, log scale and colour of its
+gaussians as floats. Element `vertex` has, for each gaussian, a position and a scale
+(11, 10 and 11 bits within these ranges), a quaternion (2 bits for the index of its
+largest component, 10 bits for each of the others), and a colour and an opacity (8 bits
+for each value). Element `sh` has one byte for each coefficient, for values from -4 to
+4, channel by channel. See docs/formats.md.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,17 +23,18 @@ from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
-# The inner shell has four times the distance from the median position that a tenth of
-# the gaussians have: all of a compact asset, and what is near where most is far away.
+# The radius of the inner shell is four times the distance from the median position that
+# a tenth of the gaussians do not exceed. It contains all of a compact asset, or the
+# dense part of an asset with far gaussians.
 _INNER_SHARE = 0.1
 _INNER_FACTOR = 4.0
 _MAX_LOG_SCALE = 20.0
 LIMITS = _packing.Limits(log_scale=(-20.0, _MAX_LOG_SCALE), harmonic=(-4.0, 4.0))
-"""What the format can hold."""
+"""The ranges of values in the format."""
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
-# The first bit of each field of a word, and its largest value.
+# For each field of a word: its lowest bit, and its largest value.
 _Fields: TypeAlias = tuple[tuple[int, int], ...]
 _XYZ: _Fields = ((21, 2047), (11, 1023), (0, 2047))
 _THREE: _Fields = ((20, 1023), (10, 1023), (0, 1023))
@@ -41,9 +43,9 @@ _RGBA: _Fields = ((24, 255), (16, 255), (8, 255), (0, 255))
 
 @dataclass(frozen=True)
 class _Element:
-    """An element of the header, and the place of its rows in the file."""
+    """An element of the header, and the offset of its rows in the file."""
 
-    kinds: dict[str, str]  # type of each property, by its name
+    kinds: dict[str, str]  # the type of each property, by name
     dtype: np.dtype[np.void]
     count: int
     offset: int
@@ -60,7 +62,7 @@ def open_file(path: AnyPath) -> AssetFile:
         check(
             path,
             name in elements,
-            f"the elements chunk and vertex of a compressed .ply, got no {name}",
+            f"the elements chunk and vertex of a compressed .ply, but {name} is missing",
         )
     chunk = elements["chunk"]
     vertex = elements["vertex"]
@@ -97,7 +99,7 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
-    """Return a sentence for each part of the file that is not read."""
+    """Return a sentence for each part of the file that is ignored."""
     used = {
         "chunk": [name for kind in _RANGES for name in _range_names(kind)],
         "vertex": list(_PACKED),
@@ -106,10 +108,10 @@ def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
     for element, read_names in used.items():
         names = [name for name in elements[element].kinds if name not in read_names]
         if names:
-            notes.append(f"Properties of {element} were left out: {listed(names)}.")
+            notes.append(f"Properties of {element} were ignored: {listed(names)}.")
     unread = [name for name in elements if name not in (*used, "sh")]
     if unread:
-        notes.append(f"Elements beside chunk, vertex and sh were left out: {listed(unread)}.")
+        notes.append(f"Elements other than chunk, vertex and sh were ignored: {listed(unread)}.")
     return tuple(notes)
 
 
@@ -119,8 +121,8 @@ def _decoded(
     ranges: dict[str, tuple[Floats, Floats]],
     sh_bytes: NDArray[np.uint8],
 ) -> tuple[Floats, ...]:
-    """Return means, quats, scales, opacities and sh of rows of `vertex` and `sh`;
-    `chunks` has the chunk of each row."""
+    """Return the means, quats, scales, opacities and sh of rows of `vertex` and `sh`.
+    `chunks` are the indices of the rows' chunks."""
 
     def interpolated(kind: str, fractions: Floats) -> Floats:
         low, high = ranges[kind]
@@ -139,8 +141,8 @@ def _decoded(
 
 
 def write(path: AnyPath, gaussians: Gaussians) -> None:
-    """Write a `.compressed.ply` file; gaussians are put in an order that keeps
-    neighbours together."""
+    """Write a `.compressed.ply` file. Gaussians are reordered so that neighbours in
+    space are close in the file."""
     host = _packing.check_writable(gaussians)
     order = chunk_order(host)
     count = len(host)
@@ -155,7 +157,8 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
     ranges = []
     fractions = {}
     for kind, array in values.items():
-        # Rounded first, so that the writer uses the range that the reader gets.
+        # The bounds are rounded before use, so that the writer and the reader have the
+        # same range.
         low = np.minimum.reduceat(array, starts).astype(np.float32)
         high = np.maximum.reduceat(array, starts).astype(np.float32)
         ranges += [low, high]
@@ -184,12 +187,13 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
 
 
 def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """The order (N,) of gaussians on the host, with finite positions, in a file.
+    """Return the order (N,) in a file of gaussians on the host with finite positions.
 
-    The range of a chunk has 1,024 or 2,048 steps, of which far gaussians would leave
-    none to near ones. So shells around the median position follow one another, each
-    along its own Morton curve. If a chunk has the end of one shell and the beginning of
-    the next, that end has the least visible gaussians of its shell.
+    The range of a chunk is divided into 1,024 or 2,048 steps, so a chunk with far
+    gaussians would be too coarse for near ones. Therefore the file contains one shell
+    around the median position after another, each along its own Morton curve. If a
+    chunk contains the end of one shell and the beginning of the next, that end has the
+    least visible gaussians of its shell.
     """
     shells = _shells(gaussians.means)
     order = np.argsort(shells, kind="stable")
@@ -210,8 +214,8 @@ def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
 
 
 def _shells(means: NDArray[np.float32]) -> NDArray[np.intp]:
-    """The shell (N,) of each position: 0 in the inner shell, and one more for each
-    doubling of its radius."""
+    """Return the shell (N,) of each position: 0 up to the radius of the inner shell,
+    and one more for each doubling of that radius."""
     if not len(means):
         return np.zeros(0, np.intp)
     positions = means.astype(np.float64)
@@ -242,7 +246,8 @@ def _header(host: Gaussians, num_chunks: int) -> bytes:
     return "\n".join(lines).encode()
 
 
-# The middle of the interval that a byte of SH stands for; the ends are exact.
+# Each byte of SH stands for the middle of an interval, except that the first and the
+# last are the exact bounds.
 _SH_VALUE = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
 _SH_VALUE[0] = -4.0
 _SH_VALUE[255] = 4.0
@@ -269,8 +274,8 @@ def _range_names(kind: str) -> list[str]:
 
 
 def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
-    """Return the kinds of ranges that chunks have; in older files, colours have
-    none."""
+    """Return the kinds of ranges that the chunks of a file have; older files have none
+    for colours."""
     kinds = [kind for kind in _RANGES if kind != "color" or chunk.kinds.keys() & _range_names(kind)]
     for kind in kinds:
         _require(path, "chunk", chunk, _range_names(kind), "float")
@@ -278,12 +283,12 @@ def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
 
 
 def _ranges(chunk: NDArray[np.void], kinds: Sequence[str]) -> dict[str, tuple[Floats, Floats]]:
-    """Return the lowest and the highest values of each chunk, (C, 3) each, by kind;
-    colours without ranges have 0 and 1."""
+    """Return, by kind, the minima and the maxima of each chunk, (C, 3) each. Colours
+    without ranges have 0 and 1."""
     shape = (len(chunk), 3)
     ranges: dict[str, tuple[Floats, Floats]] = {"color": (np.zeros(shape), np.ones(shape))}
     for kind in kinds:
-        with np.errstate(invalid="ignore"):  # signalling NaN
+        with np.errstate(invalid="ignore"):  # values may be signalling NaN
             values = np.stack([chunk[name] for name in _range_names(kind)], axis=1).astype(
                 np.float64
             )
@@ -301,7 +306,7 @@ def _degree(path: AnyPath, sh: _Element | None, count: int) -> int:
         path, is_known, f"0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}"
     )
     _require(path, "sh", sh, names, "uchar")
-    check(path, sh.count == count, f"{count} rows of element sh like vertex, got {sh.count}")
+    check(path, sh.count == count, f"{count} rows in element sh, as in vertex, got {sh.count}")
     return _packing.DEGREES[num_coefficients]
 
 
@@ -310,12 +315,12 @@ def _require(path: AnyPath, label: str, element: _Element, names: Sequence[str],
         check(
             path,
             element.kinds.get(name) == kind,
-            f"'property {kind} {name}' in element {label}, got none",
+            f"'property {kind} {name}' in element {label}, but it is missing or has another type",
         )
 
 
 def _elements(file: File) -> dict[str, _Element]:
-    """Return the elements of the header in file order, with the offsets of their
+    """Return the elements in the header of a file, in order, with the offsets of their
     rows."""
     path = file.path
     encoding, offset, header = _core.ply_header(path)
@@ -334,7 +339,11 @@ def _elements(file: File) -> dict[str, _Element]:
             f"'property float|uint|uchar NAME' in {label}, got {unknown_kind}",
         )
         is_unique = name not in elements and 0 < len(kinds) == len(properties)
-        check(path, is_unique, f"properties of {label}, each once")
+        check(
+            path,
+            is_unique,
+            f"properties of {label} with distinct names, got repeated names or no properties",
+        )
         dtype = np.dtype([(key, _PLY_TYPES[kind]) for key, kind in properties])
         num_bytes = count * dtype.itemsize
         remaining = file.num_bytes - offset
@@ -345,6 +354,6 @@ def _elements(file: File) -> dict[str, _Element]:
     check(
         path,
         offset == file.num_bytes,
-        f"the end of the file after {offset} bytes, got {file.num_bytes}",
+        f"a file that ends after {offset} bytes, as its header says, got one of {file.num_bytes}",
     )
     return elements

@@ -1,4 +1,4 @@
-"""Recognises the kind of a file by its first bytes, whatever its name says."""
+"""Recognises the format of a file by its first bytes, for any file name."""
 
 import contextlib
 import os
@@ -11,10 +11,10 @@ from v3dg.formats import ksplat, splat
 from v3dg.formats._reading import AnyPath, listed
 
 _START_BYTES = ksplat.HEADER_BYTES
-_UNPACKED_BYTES = 64  # of a gzip, to tell what is in it
-_MAX_ZIP_NAMES = 4096  # looked at
+_UNPACKED_BYTES = 64  # bytes of a gzip that are decompressed to recognise its content
+_MAX_ZIP_NAMES = 4096  # number of names in a zip that are examined
 
-# The suffix of the reader for files that begin with these bytes.
+# The suffix of the reader, by the first bytes of a file.
 _BY_START = {
     b"ply\n": ".ply",
     b"ply\r": ".ply",
@@ -23,19 +23,22 @@ _BY_START = {
     b"#usda ": ".usda",
     b"PXR-USDC": ".usdc",
 }
-# Beginnings of files that no reader reads, in lower case, and what these files are. A
-# `.splat` may begin with any number, but these are too long to begin one by chance.
+# First bytes, in lower case, of files that no reader supports, and descriptions of
+# these files. A `.splat` may begin with any bytes, but hardly by chance with so many of
+# these.
 _NOT_READ = {
-    b"version https://git-lfs": "a pointer of Git LFS in place of the file; run git lfs pull",
+    b"version https://git-lfs": "a Git LFS pointer instead of the file; run git lfs pull",
     b"<!doctype html": "a web page; download the file itself",
     b"<html": "a web page; download the file itself",
-    b"<?xml": "a text of XML",
+    b"<?xml": "an XML text",
     b"\x89png": "a picture",
     b"\xff\xd8\xff\xe0": "a picture",
     b"\xff\xd8\xff\xe1": "a picture",
-    b"\x80\x02\x8a\nl\xfc\x9cf": "a checkpoint of torch before 1.6; save it again",
-    b"7z\xbc\xaf\x27\x1c": "an archive of 7-Zip; unpack it",
-    b"rar!\x1a\x07": "an archive of RAR; unpack it",
+    b"\x80\x02\x8a\nl\xfc\x9cf": (
+        "a checkpoint of torch before 1.6; save it again with a newer torch"
+    ),
+    b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive; unpack it",
+    b"rar!\x1a\x07": "a RAR archive; unpack it",
 }
 
 
@@ -43,8 +46,9 @@ class Content(NamedTuple):
     """The kind of a file.
 
     Attributes:
-        suffix: Suffix of the reader for the file; empty if there is none.
-        text: Part of a message: what the file is, and what to do with it.
+        suffix: The suffix that selects the reader; empty if there is no reader.
+        text: A phrase for messages: what the file is and, if no reader supports it,
+            what to do.
     """
 
     suffix: str
@@ -52,13 +56,13 @@ class Content(NamedTuple):
 
 
 def content_of(path: AnyPath) -> Content | None:
-    """Return the kind of a file's content; None if its first bytes do not show it, or
+    """Return the kind of a file's content; None if the first bytes do not show it or
     cannot be read.
 
-    A few kilobytes are read, and of a zip its list of names.
+    A few kilobytes are read, and the list of names if the file is a zip.
     """
-    # zipfile and zlib do not document what damaged content raises; the reader that the
-    # name determines then says what is wrong.
+    # The exceptions of zipfile and zlib for damaged content are not documented. After
+    # any of them, the reader for the file's name reports the problem.
     with contextlib.suppress(Exception):
         with open(_files.open_regular(path), "rb") as file:
             num_bytes = os.fstat(file.fileno()).st_size
@@ -86,7 +90,7 @@ def _plain_content(start: bytes) -> Content | None:
             return Content("", text)
     header_bytes = int.from_bytes(start[:8], "little")
     if start[8:10] == b'{"' and header_bytes < 1 << 32:
-        return Content("", "a file of safetensors, as bundles (.v3dg) are")
+        return Content("", "a file of safetensors, such as a bundle (.v3dg)")
     return None
 
 

@@ -1,8 +1,9 @@
-"""glTF 2.0 with KHR_gaussian_splatting, `.glb` or `.gltf`: as attributes, or compressed
-in `.spz`.
+"""glTF 2.0 with KHR_gaussian_splatting, `.glb` or `.gltf`: the gaussians are
+attributes, or a compressed `.spz`.
 
-The writer writes one primitive. The reader reads all gaussians of a scene, each where
-its node places it. Both turn gaussians: the axes of glTF are left, up, forward.
+The writer writes one primitive. The reader reads all gaussians of a scene, placed by
+their nodes. Both convert between the axes in memory and those of glTF: left, up,
+forward.
 """
 
 import json
@@ -33,7 +34,7 @@ JsonObject: TypeAlias = dict[str, object]
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.glb` or `.gltf` file; all of it is read with its first rows."""
+    """Open a `.glb` or `.gltf` file. The first read loads all of it."""
     document = Document(Path(path))
     scene = Scene(document)
     declared = Declared(_axes.MEMORY_UP, "as in glTF", scene.antialiased, tuple(scene.notes))
@@ -46,21 +47,21 @@ def read(path: AnyPath) -> Gaussians:
 
 
 def files(path: Path) -> list[Path]:
-    """The document itself, and the files of its buffers."""
+    """Return the document itself and the files of its buffers."""
     return [path, *Document(path).buffer_files()]
 
 
 def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> None:
-    """Write a `.glb` file with float attributes, of gaussians of which `up` is up; the
-    order stays."""
+    """Write a `.glb` file with float attributes, in the order of the gaussians. `up` is
+    the axis of the gaussians that points up."""
     content = encode(_axes.turned(check_writable(gaussians), _axes.axes_of_up(up), _axes.GLTF))
     with _files.replacing(path) as temporary:
         Path(temporary).write_bytes(content)
 
 
 def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
-    """A `.glb` file of NumPy gaussians with the axes of the file, whose values the
-    format can hold."""
+    """Return the content of a `.glb` file. The gaussians are on the host, have the axes
+    of the file, and contain only values that the format can store."""
     columns = _columns(host, compressed=compressed)
     if compressed:
         parts = [b"".join(spz.encode(host))]
@@ -96,8 +97,8 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
 
 
 def _columns(host: Gaussians, *, compressed: bool) -> dict[str, NDArray[np.generic]]:
-    """The attributes of gaussians by name, (N, width); if compressed, those that `.spz`
-    does not replace."""
+    """Return the attributes of gaussians by name, (N, width); if compressed, only those
+    that are not in the `.spz`."""
     columns: dict[str, NDArray[np.generic]] = {
         "POSITION": host.means,
         f"{NAME}:SCALE": host.scales,
@@ -115,8 +116,8 @@ def _columns(host: Gaussians, *, compressed: bool) -> dict[str, NDArray[np.gener
 
 
 def _accessor(name: str, values: NDArray[np.generic], view: int | None) -> JsonObject:
-    """The accessor of an attribute and its buffer view; None for gaussians that are
-    compressed."""
+    """Return the accessor of an attribute. `view` is the index of its buffer view; None
+    for compressed gaussians."""
     kind = BYTE
     if values.dtype == np.float32:
         kind = FLOAT
@@ -136,19 +137,19 @@ def _accessor(name: str, values: NDArray[np.generic], view: int | None) -> JsonO
 
 
 def _buffer_views(parts: list[bytes], *, are_arrays: bool) -> list[JsonObject]:
-    """The views of the parts of the binary chunk, one after another."""
+    """Return the buffer views of the parts of the binary chunk."""
     views = []
     offset = 0
     for part in parts:
         view: JsonObject = {"buffer": 0, "byteOffset": offset, "byteLength": len(part)}
         if are_arrays:
-            view["target"] = _ARRAY_BUFFER  # validators ask for it
+            view["target"] = _ARRAY_BUFFER  # required by validators
         views.append(view)
         offset += len(part)
     return views
 
 
 def _chunk(kind: int, content: bytes, padding: bytes) -> bytes:
-    """A chunk of the file, padded to a multiple of four bytes."""
+    """Return a chunk of the file, padded to a multiple of four bytes."""
     content += padding * (-len(content) % 4)
     return struct.pack("<II", len(content), kind) + content

@@ -1,9 +1,9 @@
-"""`.hier`, of Hierarchical 3DGS (H3DG): a tree of gaussians, of which the leaves are
-read.
+"""`.hier`, of Hierarchical 3DGS (H3DG): a tree of gaussians. Only the leaves are read.
 
-After the number of gaussians come their columns: positions, rotations w x y z, log
-scales, opacities and SH of degree 3, then the number of nodes, the nodes, and boxes. A
-number below zero means that all but the positions is in half precision.
+The number of gaussians is followed by their columns: positions, rotations w x y z, log
+scales, opacities and SH of degree 3. Then follow the number of nodes, the nodes, and
+boxes. If the number of gaussians is negative, everything except the positions is in
+half precision.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ from v3dg.rotations import normalised
 
 _INT = np.dtype("<i4")
 _WIDTHS = (3, 4, 3, 1, 48)
-# The fields of a node that are read: its first gaussian, and how many of its gaussians
-# are leaves.
+# The fields of a node that are read: the index of its first gaussian, and the number of
+# its gaussians that are leaves.
 _FLOAT_NODE = np.dtype(
     {"names": ["start", "leaves"], "formats": ["<i4", "<i4"], "offsets": [8, 12], "itemsize": 28}
 )
@@ -29,7 +29,7 @@ _HALF_NODE = np.dtype(
 def open_file(path: AnyPath) -> AssetFile:
     """Open a `.hier` file."""
     file = File(path)
-    check(path, file.num_bytes >= 4, f"a number of gaussians, got {file.num_bytes} bytes")
+    check(path, file.num_bytes >= 4, f"a file of at least 4 bytes, got {file.num_bytes}")
     signed = int(file.rows(_INT, 0, 1)[0])
     count = abs(signed)
     kind = "<f4"
@@ -42,9 +42,10 @@ def open_file(path: AnyPath) -> AssetFile:
     columns_end = int(column_starts[-1])
     check(path, columns_end + 4 <= file.num_bytes, f"{count} gaussians, got {file.num_bytes} bytes")
     num_nodes = int(file.rows(_INT, columns_end, 1)[0])
-    node_bytes = node.itemsize + 8 * np.dtype(kind).itemsize  # including its box, which is not read
+    # Including the box of the node, which is not read.
+    node_bytes = node.itemsize + 8 * np.dtype(kind).itemsize
     fits = num_nodes * node_bytes == file.num_bytes - columns_end - 4
-    check(path, fits, f"{num_nodes} nodes and no more, got {file.num_bytes} bytes")
+    check(path, fits, f"exactly {num_nodes} nodes, got {file.num_bytes} bytes")
     leaves = _leaves(path, file.rows(node, columns_end + 4, num_nodes), count)
 
     def read(first: int, last: int) -> Gaussians:
@@ -63,8 +64,8 @@ def open_file(path: AnyPath) -> AssetFile:
             means, quats, log_scales, alphas, sh = (
                 column[block].astype(np.float64) for column in columns
             )
-            # The sign of a stored opacity means nothing, and those of inner nodes
-            # exceed 1.
+            # The sign of an opacity has no meaning, and opacities of inner nodes exceed
+            # 1.
             opacities = np.minimum(np.abs(alphas[:, 0]), 1.0)
             return means, normalised(quats), np.exp(log_scales), opacities, sh.reshape(-1, 16, 3)
 
@@ -74,13 +75,14 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def _leaves(path: AnyPath, nodes: NDArray[np.void], count: int) -> NDArray[np.int64]:
-    """Return the gaussians that are leaves, in ascending order, each once."""
+    """Return the indices of the gaussians that are leaves, ascending and without
+    repetition."""
     has_leaves = nodes["leaves"] != 0
     first = nodes["start"][has_leaves].astype(np.int64)
     size = nodes["leaves"][has_leaves].astype(np.int64)
     end = first + size
     fits = (size > 0) & (first >= 0) & (end <= count)
-    check(path, fits.all(), f"leaves among {count} gaussians, got others")
+    check(path, fits.all(), f"nodes whose leaves are among the {count} gaussians, got others")
     num_starts = np.bincount(first, minlength=count + 1)
     num_ends = np.bincount(end, minlength=count + 1)
     return np.flatnonzero(np.cumsum(num_starts - num_ends)[:count] > 0)

@@ -1,13 +1,14 @@
-"""`.ksplat`, of mkkellogg's viewer: sections of gaussians, at three levels of
-compression.
+"""`.ksplat`, of mkkellogg's viewer: sections of gaussians, with one of three
+compression levels, 0 to 2.
 
-After a header of 4,096 bytes come headers of 1,024 bytes a section, then the sections'
-data: for compression 1 and 2 the sizes of buckets that are not full and the buckets'
-centres, then the gaussians. A gaussian is its mean (float32, or 16 bits a coordinate
-around its bucket's centre), its scales and its quaternion w x y z (float32 or half
-precision), red, green, blue and opacity (bytes), and higher SH (float32, half
-precision, or bytes for the range in the header), band by band and there channel by
-channel. See docs/formats.md.
+The header of the file has 4,096 bytes. A header of 1,024 bytes for each section
+follows, then the data of the sections. At levels 1 and 2, the data of a section begin
+with the sizes of buckets that are not full and the centres of all buckets. The
+gaussians follow. Each has a mean (float32, or 16 bits per coordinate relative to the
+centre of its bucket), scales and a quaternion w x y z (float32 or half precision), red,
+green, blue and opacity (bytes), and higher SH (float32, half precision, or bytes within
+a range from the header), band by band and channel by channel in each band. See
+docs/formats.md.
 """
 
 import math
@@ -25,43 +26,43 @@ from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
 HEADER_BYTES = 4096
-_USED_HEADER_BYTES = 44  # the rest is zeros
+_USED_HEADER_BYTES = 44  # all following bytes are zero
 _MINOR = 1  # the newest version is 0.1
 _SECTION_BYTES = 1024
 _MAX_SECTIONS = 1 << 16
-# The types of a mean's coordinates, of scales and quaternions, and of higher SH, by
-# compression.
+# By compression level: the types of a mean's coordinates, of scales and quaternions,
+# and of higher SH.
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
-_SH_RANGE = (-1.5, 1.5)  # if the header has none
-_DEFAULT_STEPS = 32767  # per half side of a bucket
+_SH_RANGE = (-1.5, 1.5)  # used if the header has no range
+_DEFAULT_STEPS = 32767  # steps in half a side of a bucket
 _SECTION = struct.Struct("<IIIIfH2xI4xIIH")
 
 
 class _Section(NamedTuple):
-    """The header of a section, in the order of its fields in the file."""
+    """The header of a section, with its fields in the order of the file."""
 
     num_gaussians: int
     max_gaussians: int
-    bucket_size: int  # gaussians in a full bucket
+    bucket_size: int  # number of gaussians in a full bucket
     num_buckets: int
     bucket_side: float  # world units
     bucket_bytes: int
-    num_steps: int  # steps from a corner of a bucket to its centre; 0 is the default
+    num_steps: int  # steps in half a side of a bucket; 0 means the default
     num_full_buckets: int
     num_partial_buckets: int
     sh_degree: int
 
 
 class _Buckets(NamedTuple):
-    """The buckets that means are relative to."""
+    """The buckets of a section, for means that are stored relative to them."""
 
-    centers: NDArray[np.float32]  # (N, 3) of each gaussian's bucket
+    centers: NDArray[np.float32]  # (N, 3) centre of each gaussian's bucket
     step_world: float
-    num_steps: int  # steps from a corner to the centre
+    num_steps: int  # steps in half a side of a bucket
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.ksplat` file; all of it is read with its first rows."""
+    """Open a `.ksplat` file. The first read loads all of it."""
     with Claims().open(path) as file:
         size = os.fstat(file.fileno()).st_size
         start = file.read(min(size, HEADER_BYTES + _MAX_SECTIONS * _SECTION_BYTES))
@@ -72,8 +73,8 @@ def open_file(path: AnyPath) -> AssetFile:
 
 def is_start_of_one(start: bytes) -> bool:
     """Return whether the first bytes of a file, at least `HEADER_BYTES`, are a header
-    of this format. The format has no magic number, so the header must have plausible
-    numbers and zeros in the rest."""
+    of this format. The format has no magic number, so this requires plausible numbers
+    in the header, and zeros after them."""
     if len(start) < HEADER_BYTES or any(start[_USED_HEADER_BYTES:HEADER_BYTES]):
         return False
     major, minor, most_sections, num_sections, _, _, compression = struct.unpack_from(
@@ -85,8 +86,8 @@ def is_start_of_one(start: bytes) -> bool:
 
 
 def _declared(start: bytes) -> Declared:
-    """Return a note if the header has a newer version, in which bytes may mean
-    something else."""
+    """Return a note if the header has a newer version, whose content may differ from
+    what this reader expects."""
     minor = start[1]
     if minor <= _MINOR:
         return NOTHING
@@ -94,7 +95,7 @@ def _declared(start: bytes) -> Declared:
 
 
 def read(path: AnyPath) -> Gaussians:
-    """Read a `.ksplat` file of version 0.1 and later, of SH degree 0 to 2."""
+    """Read a `.ksplat` file of version 0.1 or later with SH degree 0 to 2."""
     content = Claims().read(path)
     sections, degree, compression = _headers(path, content)
     low, high = struct.unpack_from("<ff", content, 36)
@@ -114,16 +115,21 @@ def read(path: AnyPath) -> Gaussians:
 
 
 def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
-    """Return the headers of all sections, the SH degree and the compression;
-    ``content`` is the start of a file."""
+    """Return the headers of all sections, the SH degree and the compression level;
+    ``content`` is the beginning of a file, or all of it."""
     num_bytes = len(content)
     check(path, num_bytes >= HEADER_BYTES, f"a header of {HEADER_BYTES} bytes, got {num_bytes}")
     major, minor, num_sections, count, compression = struct.unpack_from("<BB2xI8xIH", content)
     is_known = major == 0 < minor and compression <= 2
-    kind = f"{major}.{minor}, {compression}"
-    check(path, is_known, f".ksplat 0.1 or later and compression 0 to 2, got {kind}")
+    kind = f"version {major}.{minor} and compression {compression}"
+    check(path, is_known, f".ksplat version 0.1 or later and compression 0 to 2, got {kind}")
     has_headers = num_sections <= min(_MAX_SECTIONS, (num_bytes - HEADER_BYTES) // _SECTION_BYTES)
-    check(path, has_headers, f"headers of {num_sections} sections, got {num_bytes} bytes")
+    check(
+        path,
+        has_headers,
+        f"a file with headers of {num_sections} sections, got one of {num_bytes} bytes; is it "
+        "complete?",
+    )
     end = HEADER_BYTES + num_sections * _SECTION_BYTES
     starts = range(HEADER_BYTES, end, _SECTION_BYTES)
     sections = [_Section(*_SECTION.unpack_from(content, start)) for start in starts]
@@ -137,8 +143,8 @@ def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
 def _section(
     path: AnyPath, content: bytes, start: int, number: int, section: _Section, compression: int
 ) -> tuple[NDArray[np.void], _Buckets | None, int]:
-    """Return the rows of a section, the buckets that their means are relative to, and
-    the end of the section."""
+    """Return the rows of a section, the buckets of their means, and the offset at which
+    the section ends."""
     mean_type, shape_type, sh_type = _TYPES[compression]
     count = section.num_gaussians
     max_count = section.max_gaussians
@@ -174,11 +180,15 @@ def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _S
     partial_sizes = sizes.astype(np.int64)
     num_used = section.num_full_buckets + section.num_partial_buckets
     fits = section.bucket_bytes >= 12 and num_used <= section.num_buckets
-    check(path, fits, f"{section.num_buckets} buckets in section {number}, got {num_used}")
+    check(
+        path,
+        fits,
+        f"at most {section.num_buckets} used buckets in section {number}, got {num_used}",
+    )
     full_sizes = np.full(section.num_full_buckets, section.bucket_size, np.int64)
     ends = np.cumsum(np.minimum(np.concatenate([full_sizes, partial_sizes]), count))
     is_enough = not count or (len(ends) and ends[-1] >= count)
-    check(path, is_enough, f"buckets for {count} gaussians in section {number}, got fewer")
+    check(path, is_enough, f"buckets for all {count} gaussians of section {number}, got too few")
     bucket_from_row = np.searchsorted(ends, np.arange(count), side="right")
     bucket = np.dtype((np.void, section.bucket_bytes))
     buckets_start = start + 4 * section.num_partial_buckets
@@ -195,7 +205,7 @@ def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _S
 def _decoded(
     records: NDArray[np.void], buckets: _Buckets | None, degree: int, sh_range: tuple[float, float]
 ) -> Gaussians:
-    """Return the gaussians of a section; their coefficients are padded with zeros to
+    """Return the gaussians of a section, whose coefficients are padded with zeros up to
     ``degree``."""
 
     def decode(block: slice) -> tuple[Floats, ...]:
@@ -212,7 +222,8 @@ def _decoded(
         for band in range(1, math.isqrt(1 + higher.shape[1] // 3)):
             first = band**2
             last = (band + 1) ** 2
-            coefficients = higher[:, 3 * (first - 1) : 3 * (last - 1)]  # channel by channel
+            # In the order of the file: channel by channel.
+            coefficients = higher[:, 3 * (first - 1) : 3 * (last - 1)]
             sh[:, first:last] = coefficients.reshape(-1, 3, last - first).transpose(0, 2, 1)
         return means, normalised(rows["quat"]), rows["scale"], rgba[:, 3], sh
 

@@ -1,4 +1,4 @@
-"""`.ply`, as trainers write it: the core reads and writes it. See docs/formats.md."""
+"""`.ply` as trainers write it. The core reads and writes it. See docs/formats.md."""
 
 import os
 from collections.abc import Sequence
@@ -19,13 +19,14 @@ write_compressed = compressed_ply.write
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 _Elements: TypeAlias = Sequence[tuple[str, int, Sequence[tuple[str, str]]]]
 
-_NORMALS = ("nx", "ny", "nz")  # zeros in the files of the 3DGS code
-_MAX_COLOR = 8.0  # of a float for 0 to 1: larger ones are for 0 to 255
+_NORMALS = ("nx", "ny", "nz")  # the code of 3DGS writes zeros here
+# Floats up to this value count as colours of 0 to 1, larger ones as 0 to 255.
+_MAX_COLOR = 8.0
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.ply` file; one with packed positions is a compressed one, whatever its
-    name."""
+    """Open a `.ply` file. A file with packed positions is read as a compressed one, for
+    any file name."""
     name = os.fspath(path)
     _, _, elements = _core.ply_header(name)
     if any("packed_position" in dict(properties) for _, _, properties in elements):
@@ -49,15 +50,16 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def _check_colors(path: AnyPath, gaussians: Gaussians) -> None:
-    """Raise ValueError for base colours that were not stored for 0 to 1."""
+    """Raise ValueError for base colours that seem to be stored as 0 to 255."""
     largest = float(np.nan_to_num(gaussians.sh[:, 0]).max(initial=0.0)) * SH_C0 + 0.5
-    expected = "colours of 0 to 1 in properties of floats"
+    expected = "colours from 0 to 1 in float properties"
     advice = "divide them by 255, or store them as uchar"
     check(path, largest <= _MAX_COLOR, f"{expected}, got {largest:g}; {advice}")
 
 
 def _declared(comments: Sequence[str], elements: _Elements, used: set[str]) -> Declared:
-    """What a file has beside the numbers that are read as they are meant."""
+    """Return what a file declares, with notes about content that is ignored or
+    converted."""
     by_comments = _ply_comments.declared_by(comments)
     vertex = next(properties for name, _, properties in elements if name == "vertex")
     unread = [name for name, _ in vertex if name not in used and name not in _NORMALS]
@@ -68,7 +70,7 @@ def _declared(comments: Sequence[str], elements: _Elements, used: set[str]) -> D
             "they were read as ellipsoids of no thickness."
         )
     if "f_dc_0" not in used:
-        notes.append("Red, green and blue were read as base colours, because f_dc_0 is missing.")
+        notes.append("Red, green and blue were read as base colours because f_dc_0 is missing.")
     antialiased = by_comments.antialiased
     if "filter_3D" in used:
         if antialiased is None:
@@ -76,13 +78,13 @@ def _declared(comments: Sequence[str], elements: _Elements, used: set[str]) -> D
         notes.append("filter_3D of Mip-Splatting was applied to scales and opacities.")
     high_coefficients = [name for name in unread if name.startswith("f_rest_")]
     if high_coefficients:
-        notes.append("Coefficients of SH degree 4 were left out.")
+        notes.append("Coefficients of SH degree 4 were ignored.")
         unread = [name for name in unread if name not in high_coefficients]
     if unread:
-        notes.append(f"Properties of vertex that no gaussian has were left out: {listed(unread)}.")
+        notes.append(f"Properties of vertex that are unknown were ignored: {listed(unread)}.")
     left_out = [name for name, count, _ in elements if name != "vertex" and count]
     if left_out:
-        notes.append(f"Elements beside vertex were left out: {listed(left_out)}.")
+        notes.append(f"Elements other than vertex were ignored: {listed(left_out)}.")
     return replace(by_comments, antialiased=antialiased, notes=tuple(notes))
 
 

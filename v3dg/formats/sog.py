@@ -1,10 +1,10 @@
-"""SOG, of PlayCanvas: pictures whose pixels are gaussians, and a `meta.json`; in a zip
+"""SOG, of PlayCanvas: pictures with one pixel per gaussian, and a `meta.json`, in a zip
 (`.sog`) or a folder.
 
-Version 2: positions are 16 bits a coordinate of sign(x) ln(1 + |x|), log scales and
-colours are indices into tables of 256 values, quaternions three bytes and the index of
-the largest component, opacity is a byte, and higher SH an index into a palette of whole
-sets of coefficients. See docs/formats.md.
+In version 2, a position has 16 bits per coordinate, for sign(x) ln(1 + |x|). Log scales
+and colours are indices into tables of 256 values. A quaternion has three bytes and the
+index of its largest component, and an opacity one byte. Higher SH are an index into a
+palette of sets of coefficients. See docs/formats.md.
 """
 
 import io
@@ -39,28 +39,28 @@ from v3dg.formats._reading import (
 from v3dg.gaussians import Gaussians
 
 _Pixels: TypeAlias = NDArray[np.uint8]
-_MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
-# A picture may have this many times the pixels that are needed, because writers round
-# up differently, plus a constant.
+_MAX_GAUSSIANS = 1 << 28  # number of pixels in the largest WebP
+# A picture may have more pixels than gaussians, because writers round its size up
+# differently: this many times the number, plus a constant.
 _MAX_PIXELS_FACTOR = 4
 _FREE_PIXELS = 1 << 16
 _LEAST_PALETTE = 1024
 _FULL_PALETTE = 32768
-_MOST_PALETTE = 65536  # labels have 16 bits
-_PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
-_MAX_LOG = 88.0  # about the log of the largest float32
+_MOST_PALETTE = 65536  # the largest number of labels with 16 bits
+_PALETTE_COLUMNS = 64  # number of palette entries in a row of the palette's picture
+_MAX_LOG = 88.0  # about the logarithm of the largest float32
 
-# Models of splat-transform, and whether they are antialiased.
+# The models of splat-transform, and whether each of them is antialiased.
 _MODELS: dict[str, bool | None] = {"default": False, "antialiased": True, "2dgs": None}
-_RESOURCE_FORKS = "__MACOSX/"  # the folder of what the Finder adds to a zip
+_RESOURCE_FORKS = "__MACOSX/"  # folder that macOS Finder adds to a zip
 
-# Number of pictures of each part of meta.json.
+# The number of pictures for each part of meta.json.
 _PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 _FIELDS = ("version", "count", "asset", "model", "antialias", *_PARTS)
 
 
 def open_file(path: str | os.PathLike[str]) -> AssetFile:
-    """Open a `.sog` file or a `meta.json`; all is read with its first rows."""
+    """Open a `.sog` file or a `meta.json`. The first read loads all of it."""
     path = Path(path)
     with Claims().open(path) as file:
         if path.suffix == ".json":
@@ -74,7 +74,7 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
 
 
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
-    """Read a `.sog` file, or the `meta.json` of a folder with its pictures."""
+    """Read a `.sog` file, or a `meta.json` and the pictures in its folder."""
     path = Path(path)
     claims = claims or Claims()
     if path.suffix == ".json":
@@ -89,24 +89,29 @@ def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussian
 
 
 def _folder_in(path: Path, archive: Archive) -> str:
-    """Return the folder of a zip that contains its meta.json, with a slash at the end;
-    "" if it is at the top."""
+    """Return the folder of a zip that contains meta.json, with a slash at the end; ""
+    if meta.json is not in a folder."""
     names = [name for name in archive.names if not name.startswith(_RESOURCE_FORKS)]
     is_streamed = any(name.rsplit("/", 1)[-1] == "lod-meta.json" for name in names)
-    advice = "unpack it, and open its lod-meta.json"
+    advice = "unpack the zip and open lod-meta.json"
     check(path, not is_streamed, f"one SOG in the zip, got a streamed SOG; {advice}")
     if "meta.json" in names:
         return ""
     folders = [name.removesuffix("meta.json") for name in names if name.endswith("/meta.json")]
     names_of_folders = listed(folders)
     check(
-        path, len(folders) <= 1, f"one SOG in the zip, got several: {names_of_folders}; unpack it"
+        path,
+        len(folders) <= 1,
+        (
+            f"one SOG in the zip, got several: {names_of_folders}; unpack the zip and open a "
+            "meta.json"
+        ),
     )
     return "".join(folders)
 
 
 def files(path: Path) -> list[Path]:
-    """Return the `.sog` file itself, or a `meta.json` and its pictures."""
+    """Return the `.sog` file itself, or the `meta.json` and its pictures."""
     if path.suffix != ".json":
         return [path]
     names = _names(_meta(path, Claims().read(path)))
@@ -118,10 +123,12 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     count, degree = _size(meta)
     names = _names(meta)
     pictures = {name: load(name) for part in names.values() for name in part}
-    claims.add(path, count)  # after all files are open, because their sizes bound the claim
+    # After opening all files, because their total size bounds the number.
+    claims.add(path, count)
 
     def pixels(name: str) -> _Pixels:
-        """Return (N, 4) red, green, blue and alpha: one pixel for each gaussian."""
+        """Return (N, 4) red, green, blue and alpha of a picture: one pixel per
+        gaussian."""
         return _decoded(path, name, pictures[name], count).reshape(-1, 4)[:count]
 
     low, high = (np.array(meta["means"].field(name).vector(3)) for name in ("mins", "maxs"))
@@ -131,7 +138,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     color_table = _codebook(meta["sh0"])
     tags = quats[:, 3]
     smallest = tags.min(initial=255)
-    check(path, smallest >= 252, f"quaternions tagged 252 to 255, got {smallest}")
+    check(path, smallest >= 252, f"quaternions with tags from 252 to 255, got {smallest}")
     higher = _NO_HIGHER_SH
     labels: _packing.Integers = np.zeros(count, np.uint16)
     if "shN" in meta:
@@ -158,10 +165,12 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
 
 
 class _Palette(NamedTuple):
-    """The higher SH that gaussians refer to by label."""
+    """The palette of higher SH; each gaussian has the label of an entry."""
 
     table: Floats  # (256,) values
-    entries: _Pixels  # (P, K, 3) indices into the table; P is num_entries rounded up to full rows
+    # (P, K, 3) indices into the table; P is num_entries, rounded up to full rows of the
+    # picture.
+    entries: _Pixels
     num_entries: int
 
 
@@ -171,7 +180,7 @@ _NO_HIGHER_SH = _Palette(np.zeros(1), np.zeros((1, 0, 3), np.uint8), 1)
 def _palette(
     path: Path, part: Node, name: str, pictures: dict[str, bytes], degree: int
 ) -> _Palette:
-    num_entries = integer_of(part.field("count"), "1 to 65536 entries", 1, 65536)
+    num_entries = integer_of(part.field("count"), "an integer from 1 to 65536", 1, 65536)
     table = _codebook(part)
     num_rows = -(-num_entries // _PALETTE_COLUMNS)
     width = _PALETTE_COLUMNS * ((degree + 1) ** 2 - 1)
@@ -193,7 +202,7 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
     with value_errors(path, "JSON in meta.json"):
         document = parse_json(text)
     meta = Node(document, os.fspath(path), "")
-    advice = "convert it with splat-transform first"
+    advice = "convert the file with splat-transform first"
     check(path, "version" in meta.some_fields(()), f"SOG version 2, got an older file; {advice}")
     if meta.value["version"] != 2:
         raise meta.field("version").error("SOG version 2")
@@ -201,8 +210,8 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
 
 
 def _declared(meta: dict[str, Node]) -> Declared:
-    """What meta.json declares beside the pictures: `antialias`, of the specification,
-    and `model`, of splat-transform, which counts where there are both."""
+    """Return what meta.json declares. `antialias` is from the specification, `model`
+    from splat-transform; if a file has both, `model` counts."""
     notes = []
     antialiased: bool | None = None
     if "antialias" in meta:
@@ -214,17 +223,17 @@ def _declared(meta: dict[str, Node]) -> Declared:
         if model in _MODELS:
             antialiased = _MODELS[model]
         else:
-            notes.append(f"The model {json_text(model)} is not known and was left out.")
+            notes.append(f"The model {json_text(model)} is unknown and was ignored.")
         if model == "2dgs":
             notes.append("The gaussians are those of 2DGS; they were read as flat ellipsoids.")
     unread = [name for name in meta if name not in _FIELDS]
     if unread:
-        notes.append(f"Fields of meta.json were left out: {listed(unread)}.")
+        notes.append(f"Fields of meta.json were ignored: {listed(unread)}.")
     return Declared(antialiased=antialiased, notes=tuple(notes))
 
 
 def _size(meta: dict[str, Node]) -> tuple[int, int]:
-    """Return the number of gaussians, and their SH degree."""
+    """Return the number of gaussians and the SH degree."""
     count = integer_of(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
     if "shN" not in meta:
         return count, 0
@@ -232,8 +241,8 @@ def _size(meta: dict[str, Node]) -> tuple[int, int]:
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
-    """Return the names of the pictures of each part, which are beside meta.json; files
-    outside of its folder are not read."""
+    """Return the names of the pictures of each part. All must be in the folder of
+    meta.json."""
     names = {}
     for part, count in _PARTS.items():
         if part in meta:
@@ -250,10 +259,10 @@ def _beside(node: Node) -> str:
 
 
 def _codebook(part: Node) -> Floats:
-    """A table of 256 values."""
+    """Return a table of 256 values."""
     entries = list(part.field("codebook").items("1 to 256 numbers", 1, 256))
-    # Some versions of splat-transform wrote null for the first value, which is
-    # extrapolated.
+    # Some versions of splat-transform wrote null for the first value. It is
+    # extrapolated from the others.
     has_null = entries[0].value is None and len(entries) == 256
     values = [entry.number() for entry in entries[has_null:]]
     if has_null:
@@ -264,8 +273,8 @@ def _codebook(part: Node) -> Floats:
 def _decoded(
     path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None
 ) -> _Pixels:
-    """Return the pixels (H, W, 4) of a picture, which has at least ``num_pixels`` and
-    not many more, in rows of ``row``."""
+    """Return the pixels (H, W, 4) of a picture. It must have at least ``num_pixels``
+    pixels and not many more, and the width ``row`` if that is not None."""
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would also try other formats
 
     width, height = _size_of_webp(content)
@@ -273,7 +282,7 @@ def _decoded(
     has_size = num_pixels <= width * height <= _MAX_PIXELS_FACTOR * num_pixels + _FREE_PIXELS
     expected = f"{num_pixels} pixels"
     if row is not None:
-        expected += f" in rows of {row}"
+        expected += f"in rows of {row} pixels"
     check(
         path, has_size and row in (None, width), f"{expected} in {name!a}, got {width} x {height}"
     )
@@ -282,13 +291,13 @@ def _decoded(
         WebPImageFile(io.BytesIO(content)) as picture,
     ):
         if picture.size != (width, height):
-            raise ValueError(f"one of {picture.size}")
+            raise ValueError(f"a picture of {picture.size} pixels")
         return np.asarray(picture.convert("RGBA"))
 
 
 def _size_of_webp(content: bytes) -> tuple[int, int]:
-    """Return the width and the height from the first chunk, before a decoder allocates
-    memory for them; 0, 0 for another file."""
+    """Return the width and the height of a WebP picture from its first chunk, before a
+    decoder allocates memory for it; 0, 0 if the content is not WebP."""
 
     def number(first: int, size: int) -> int:
         return int.from_bytes(content[first : first + size], "little")
@@ -304,32 +313,32 @@ def _size_of_webp(content: bytes) -> tuple[int, int]:
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.sog` file; gaussians are put in an order that keeps neighbours
-    together."""
+    """Write a `.sog` file. Gaussians are reordered so that neighbours in space are
+    close in the file."""
     host = _packing.check_writable(gaussians)
-    # A small asset keeps the higher SH of every gaussian, and a larger one many: half
-    # the palette would halve its bytes and cost 5 to 30 dB.
+    # All gaussians of a small asset, and many of a larger one, keep their own higher
+    # SH. Half the palette would halve its bytes but lose 5 to 30 dB.
     size = max(len(host) // 4, min(len(host), _FULL_PALETTE))
     contents = encode(host.subset(_packing.curve_order(host)), palette_size=size)
-    # Readers refuse files that are too small for what they claim; equal gaussians
-    # compress to almost nothing.
+    # Readers reject files that are too small for the number of their gaussians, and
+    # equal gaussians compress to almost nothing.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
     if missing > 0:
         contents["padding"] = bytes(missing)
     with _files.replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
         for name, content in contents.items():
-            # Dated 1980, so that files are reproducible.
+            # All members have the date 1980-01-01, so that files are reproducible.
             bundle.writestr(zipfile.ZipInfo(name), content)
 
 
 def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str, bytes]:
-    """Return the files of a SOG by name; ``gaussians`` have passed `check_writable`,
-    and keep their order.
+    """Return the content of the files of a SOG, by name. ``gaussians`` must have passed
+    `check_writable`; their order is kept.
 
     Args:
-        palette_size: Number of sets of higher SH, at most 65,536 of which are made;
-            None is a quarter of the gaussians and at least 1024, for chunks that are
-            fetched.
+        palette_size: Number of sets of higher SH; at most 65,536 are used. None means a
+            quarter of the number of gaussians, but at least 1024, which suits small
+            files that are downloaded.
     """
     count = len(gaussians)
     width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
@@ -375,7 +384,7 @@ def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str
 
 
 def _declarations(gaussians: Gaussians) -> dict[str, object]:
-    """What meta.json says of gaussians beside their numbers."""
+    """Return the entries of meta.json that declare properties of all gaussians."""
     declarations: dict[str, object] = {"asset": {"generator": f"v3dg {__version__}"}}
     if gaussians.antialiased is not None:
         declarations["antialias"] = gaussians.antialiased
@@ -387,8 +396,8 @@ def _declarations(gaussians: Gaussians) -> dict[str, object]:
 def _encoded_means(
     means: NDArray[np.float32],
 ) -> tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions as 16-bit steps (N, 3) between the lowest and the highest logs,
-    and these two bounds, (3,) each."""
+    """Return positions as 16-bit steps (N, 3) between a minimum and a maximum
+    logarithm, and the minima and the maxima, (3,) each."""
     doubles = means.astype(np.float64)
     logs = np.sign(doubles) * np.log1p(np.abs(doubles))
     low = np.zeros(3)
@@ -403,8 +412,8 @@ def _encoded_means(
 def _encoded_palette(
     gaussians: Gaussians, palette_size: int | None
 ) -> tuple[dict[str, object], bytes, _packing.Integers]:
-    """Return the part of meta.json for higher SH, the picture of its palette, and a
-    label for each gaussian."""
+    """Return the part of meta.json for higher SH, the picture of the palette, and the
+    label of each gaussian."""
     count = len(gaussians)
     num_coefficients = (gaussians.sh_degree + 1) ** 2 - 1
     vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * num_coefficients)
@@ -424,7 +433,7 @@ def _encoded_palette(
 
 
 def _table_of(values: Floats) -> Floats:
-    """256 ascending numbers near the values."""
+    """Return 256 ascending numbers that approximate the values."""
     return _core.codebook_of(values.astype(np.float64).ravel())
 
 

@@ -1,9 +1,9 @@
-"""`.splat`, of antimatter15's viewer: 32 bytes a gaussian, colour without view
-dependence.
+"""`.splat`, of antimatter15's viewer: 32 bytes per gaussian, with colours that do not
+depend on the view.
 
-A record is the mean (3 float32), the scales (3 float32, not logs), red, green, blue and
-opacity (a byte each) and the quaternion w x y z (a byte each, 128 for 0). There is no
-header.
+A record contains the mean (3 float32), the scales (3 float32, not logarithms), red,
+green, blue and opacity (one byte each), and the quaternion w x y z (one byte each,
+where 128 means 0). There is no header.
 """
 
 import numpy as np
@@ -15,13 +15,14 @@ from v3dg.rotations import normalised
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
-_QUATERNION_LENGTHS = (124.0, 132.0)  # of one of length 1, in steps of its bytes
-_LARGEST = 1e9  # a coordinate or a scale beyond it is not one of an asset
+# Accepted lengths of a unit quaternion, in steps of its bytes.
+_QUATERNION_LENGTHS = (124.0, 132.0)
+_LARGEST = 1e9  # assets have no larger coordinates and scales
 
 
 def is_start_of_one(start: bytes, num_bytes: int) -> bool:
-    """Return whether these first bytes of a file of this length can only be records:
-    their quaternions have the length 1, and their numbers are plausible."""
+    """Return whether a file of this length with these first bytes is a `.splat`: the
+    bytes must be records with unit quaternions and plausible numbers."""
     num_records = len(start) // _RECORD.itemsize
     if num_bytes % _RECORD.itemsize or not num_records:
         return False

@@ -1,13 +1,14 @@
-"""`.spz`, of Niantic: about 20 bytes a gaussian before compression, fixed-point
+"""`.spz`, of Niantic: about 20 bytes per gaussian before compression, with fixed-point
 positions.
 
 Versions 1 to 3 are one gzip stream: a header of 16 bytes, then positions, opacities,
-colours, scales, rotations and higher SH, each for all gaussians. Version 4 is a header
-of 32 bytes, a table of sizes and a zstd stream an attribute. Version 1 has positions in
-half precision, 1 and 2 quaternions without w. Axes are right, up, back, unless the
-extension SPZ_ADOBE_coordinate_system records others. Some programs store those of
-`.ply` without a record: a ground, where there is one, shows which they are. See
-docs/formats.md.
+colours, scales, rotations and higher SH, each for all gaussians. Version 4 has a header
+of 32 bytes, a table of sizes, and one zstd stream for each attribute. Version 1 stores
+positions in half precision; versions 1 and 2 store quaternions without w.
+
+The axes are right, up, back, unless the extension SPZ_ADOBE_coordinate_system declares
+others. Some programs store the axes of `.ply` without declaring them. If the gaussians
+contain a ground, it shows which axes they have. See docs/formats.md.
 """
 
 import math
@@ -42,22 +43,25 @@ _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
 MAX_START = 1 << 16
-"""Bytes that contain the header, also after the optional fields of a gzip header."""
-_MAX_TRAILER = 1 << 20  # bytes after the attributes, for extensions of vendors
+"""Number of bytes at the beginning of a file that always contain the header, even after
+the optional fields of a gzip header."""
+_MAX_TRAILER = 1 << 20  # bytes for extensions of vendors, after the attributes
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
 # Bits of the flags.
 _ANTIALIASED = 1
 _HAS_EXTENSIONS = 2
-_MOST_POINTS = 100_000  # that a ground is sought among
-_EXTENSION = struct.Struct("<II")  # a type and the bytes that follow
+_MOST_POINTS = 100_000  # number of points that are used to detect a ground
+# The type of an extension and the number of bytes that follow.
+_EXTENSION = struct.Struct("<II")
 _AXES_EXTENSION = 0xADBE0003  # SPZ_ADOBE_coordinate_system
-# The axes by their number in that extension, of version 4 of the library.
+# The axes by their number in that extension, as defined by version 4 of the library.
 _AXES = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
 )
-# Programs that turn nothing store gaussians that have these axes, by what is up.
+# The axes of files by programs that store gaussians unchanged, by the axis that points
+# up.
 _STORED_AXES: dict[Axis, str] = {"y": _axes.OPENGL, "-y": _axes.MEMORY, "z": _axes.Z_UP}
 
 
@@ -66,12 +70,12 @@ LIMITS = _packing.Limits(
     color=(-0.5 / _COLOR_SCALE, 0.5 / _COLOR_SCALE),
     harmonic=(-1.0, 127.5 / 128),
 )
-"""The ranges of values in the format. Where values half a step beyond are rounded into
-the range, they include that half step."""
+"""The ranges of values in the format, extended by half a step where values beyond the
+range are rounded into it."""
 
 
 class Header(NamedTuple):
-    """What the first bytes of a file say."""
+    """The header of a file."""
 
     version: int
     sh_degree: int
@@ -86,7 +90,8 @@ class Header(NamedTuple):
 
     @property
     def section_bytes(self) -> list[int]:
-        """Size of positions, opacities, colours, scales, rotations and higher SH."""
+        """The sizes in bytes of positions, opacities, colours, scales, rotations and
+        higher SH."""
         position_bytes = 9
         if self.version == 1:
             position_bytes = 6
@@ -100,16 +105,16 @@ class Header(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Content:
-    """What a file holds, expanded."""
+    """The decompressed content of a file."""
 
     header: Header
     sections: list[memoryview]
-    extensions: bytes  # records of a type, a length and a payload
+    extensions: bytes  # records, each with a type, a length and a payload
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.spz` file of version 1 to 4, which is expanded; all of its gaussians are
-    decoded with the first."""
+    """Open a `.spz` file of version 1 to 4 and decompress it. The first read decodes
+    all gaussians."""
     claims = Claims()
     content = _expanded(path, claims.read(path), claims)
     axes, reason = _axes_of(path, content)
@@ -123,7 +128,8 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Header:
-    """The header in the first `MAX_START` bytes of a `.spz` file's content."""
+    """Return the header of a `.spz` file, given the first `MAX_START` bytes of the
+    file."""
     header = bytes(start)
     if header[:2] == b"\x1f\x8b":
         with value_errors(path, "a gzip stream that is not damaged"):
@@ -132,7 +138,8 @@ def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Heade
 
 
 def decode(path: AnyPath, content: bytes, claims: Claims) -> Gaussians:
-    """Return the gaussians of the content of a `.spz` file, in the axes of the file."""
+    """Return the gaussians of a `.spz` file with this content, in the axes of the
+    file."""
     return _decode(_expanded(path, content, claims))
 
 
@@ -149,21 +156,21 @@ def _expanded(path: AnyPath, content: bytes, claims: Claims) -> _Content:
 def write(
     path: AnyPath, gaussians: Gaussians, version: int = 3, *, up: Axis = _axes.MEMORY_UP
 ) -> None:
-    """Write a `.spz` file of version 2, 3 or 4, of gaussians of which `up` is up; the
-    order stays."""
-    check("version", version in (2, 3, 4), f"2, 3 or 4 for .spz, got {version}")
+    """Write a `.spz` file of version 2, 3 or 4, in the order of the gaussians. `up` is
+    the axis of the gaussians that points up."""
+    check("version", version in (2, 3, 4), f"2, 3 or 4 for a .spz file, got {version}")
     host = _axes.turned(_packing.check_writable(gaussians), _axes.axes_of_up(up), _axes.OPENGL)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         for part in encode(host, version, axes=_axes.OPENGL):
             file.write(part)
-        # Readers refuse files that are too small for what they claim, and ignore zeros
-        # at the end.
+        # Readers reject files that are too small for the number of their gaussians, and
+        # ignore zeros at the end.
         file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
 
 
 def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[bytes]:
-    """Parts of a `.spz` file, which records its axes if they are given; ``host`` has
-    passed `check_writable`."""
+    """Yield the parts of a `.spz` file. ``host`` must have passed `check_writable`. The
+    file declares its axes if ``axes`` is not empty."""
     bits = _fraction_bits(host.means)
 
     def fixed(rows: slice) -> bytes:
@@ -204,8 +211,8 @@ def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[byt
 
 
 def _fraction_bits(means: NDArray[np.float32]) -> int:
-    """12, as in Niantic's writer, or more if a step were above 2^-17 of the largest
-    coordinate."""
+    """Return the number of fraction bits: 12, as in Niantic's writer, or more if one
+    step would exceed 2^-17 of the largest coordinate."""
     reach = float(np.abs(means).max(initial=0.0))
     integer_bits = 0
     if reach > 0:
@@ -219,8 +226,8 @@ def _fraction_bits(means: NDArray[np.float32]) -> int:
 def _zstd_parts(
     header: bytes, extensions: bytes, count: int, sections: list[Callable[[slice], bytes]]
 ) -> Iterator[bytes]:
-    """Yield the header, which has the number of streams and the offset of their table;
-    then the extensions, the table of sizes, and the streams."""
+    """Yield the header, which contains the number of streams and the offset of their
+    table, then the extensions, the table of sizes, and the streams."""
     import zstandard
 
     raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
@@ -237,13 +244,14 @@ def _bytes(values: Floats) -> bytes:
 
 
 def _rotation_bytes(quats: Floats) -> bytes:
-    """Return x y z, as bytes, of the quaternions whose w is not negative."""
+    """Return the components x y z as bytes, after negating quaternions whose w is
+    negative."""
     unit = normalised(quats)
     return _bytes((unit[:, 1:] * np.where(unit[:, :1] < 0, -1.0, 1.0) + 1.0) * 127.5)
 
 
 def _rotation_words(quats: Floats) -> bytes:
-    # This format numbers components x y z w.
+    # SPZ orders the components of a quaternion x y z w.
     three, largest = _packing.three_of_quats(np.roll(quats, -1, axis=1))
     magnitude = _packing.to_integers(np.abs(three) * SQRT2 * 511.0, 511)
     fields = magnitude | ((three < 0).astype(np.uint32) << 9)
@@ -252,7 +260,7 @@ def _rotation_words(quats: Floats) -> bytes:
 
 
 def _means(content: _Content, rows: slice) -> Floats:
-    """Return (N, 3) positions as they are stored."""
+    """Return the stored positions, (N, 3)."""
     positions = np.frombuffer(content.sections[0], "u1")
     if content.header.version == 1:
         return positions.view("<f2").reshape(-1, 3)[rows].astype(np.float64)
@@ -262,25 +270,28 @@ def _means(content: _Content, rows: slice) -> Floats:
 
 
 def _axes_of(path: AnyPath, content: _Content) -> tuple[str, str]:
-    """Return the axes of the stored gaussians, and a phrase that says how they are
-    known."""
+    """Return the axes of the stored gaussians, and the source of that knowledge as a
+    phrase."""
     for kind, payload in _records(content.extensions):
         if kind == _AXES_EXTENSION:
             number = int.from_bytes(payload, "little")
             is_known = len(payload) == 4 and number < len(_AXES)
-            expected = f"axes 0 to {len(_AXES) - 1} in their record, got {payload[:8].hex(' ')}"
+            expected = (
+                f"an axes record with a number from 0 to {len(_AXES) - 1}, got "
+                f"{payload[:8].hex(' ')}"
+            )
             check(path, is_known, expected)
             if _AXES[number]:
                 return _AXES[number], f"as its record of axes says ({_AXES[number]})"
     stride = max(1, content.header.num_gaussians // _MOST_POINTS)
     up = _axes.up_of_ground(_means(content, slice(None, None, stride)))
     if up is None:
-        return _axes.OPENGL, "as in .spz, which has y up"
-    return _STORED_AXES[up], f"guessed from its ground, with which {up} is up in the file"
+        return _axes.OPENGL, "as specified for .spz, with y up"
+    return _STORED_AXES[up], f"guessed from its ground, which shows that {up} is up in the file"
 
 
 def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
-    """Type and payload of each extension."""
+    """Yield the type and the payload of each extension."""
     first = 0
     while first + _EXTENSION.size <= len(extensions):
         kind, num_bytes = _EXTENSION.unpack_from(extensions, first)
@@ -290,9 +301,9 @@ def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _notes(content: _Content) -> tuple[str, ...]:
-    """Sentences about what is in the file and was not read."""
+    """Return sentences about content of the file that is ignored."""
     extensions = tuple(
-        f"Its extension {kind:#010x}, of {len(payload)} bytes, is not read."
+        f"Its extension {kind:#010x}, of {len(payload)} bytes, was ignored."
         for kind, payload in _records(content.extensions)
         if kind != _AXES_EXTENSION
     )
@@ -300,11 +311,11 @@ def _notes(content: _Content) -> tuple[str, ...]:
 
 
 def flag_notes(header: Header) -> tuple[str, ...]:
-    """Sentences about flags that were not understood."""
+    """Return a sentence about unknown flags, if there are any."""
     unknown = header.flags & ~(_ANTIALIASED | _HAS_EXTENSIONS)
     if not unknown:
         return ()
-    return (f"Its flags {unknown:#04x} are unknown, and are not read.",)
+    return (f"Its flags {unknown:#04x} are unknown and were ignored.",)
 
 
 def _decode(content: _Content) -> Gaussians:
@@ -332,8 +343,8 @@ def _decode(content: _Content) -> Gaussians:
 
 
 def _quats(rotations: NDArray[np.uint8]) -> Floats:
-    """Return quaternions w x y z from words (version 3 and later), or from x y z as
-    bytes."""
+    """Return quaternions w x y z, given words (version 3 or later) or the bytes of x y
+    z."""
     if rotations.shape[1] == 3:
         xyz = rotations / 127.5 - 1.0
         return normalised(_packing.quats_from_three(xyz, np.zeros(len(xyz), np.intp)))
@@ -363,13 +374,18 @@ def _sections_of_gzip(path: AnyPath, content: bytes, claims: Claims) -> _Content
     sizes = header.section_bytes
     total = sum(sizes)
     with value_errors(path, "a gzip stream that is not damaged"):
-        # The limit is never 0, which would mean none.
+        # A limit of 0 would mean no limit; this one is always positive.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
-            # Reads the checksum if nothing else follows.
+            # This reads the checksum if nothing else follows.
             stream.decompress(stream.unconsumed_tail, 1)
     is_whole = len(body) >= total and stream.eof
-    check(path, is_whole, f"a gzip stream that ends after {total} bytes of gaussians, got another")
+    check(
+        path,
+        is_whole,
+        f"a gzip stream that ends after {total} bytes of gaussians, got another; is the file "
+        "complete?",
+    )
     ends = np.cumsum(sizes).tolist()
     sections = [memoryview(body)[end - size : end] for size, end in zip(sizes, ends, strict=True)]
     extensions = b""
@@ -385,11 +401,7 @@ def _sections_of_zstd(path: AnyPath, content: bytes, claims: Claims) -> _Content
     has_header = num_bytes >= _ZSTD_HEADER_BYTES
     check(path, has_header, f"a header of {_ZSTD_HEADER_BYTES} bytes, got {num_bytes}")
     header = _checked_header(path, content, claims)
-    check(
-        path,
-        header.version == 4,
-        f"version {header.version} in a gzip stream, got it outside of one",
-    )
+    check(path, header.version == 4, f"version 4 without gzip, got version {header.version}")
     sizes = header.section_bytes
     if not header.sh_degree:
         del sizes[-1]
@@ -400,13 +412,14 @@ def _sections_of_zstd(path: AnyPath, content: bytes, claims: Claims) -> _Content
     check(
         path,
         has_table,
-        f"a table of {len(sizes)} streams after the header, got {num_streams} at {table}",
+        f"a table of {len(sizes)} streams after the header, got one of {num_streams} at offset "
+        f"{table}",
     )
     sections = []
     for i, size in enumerate(sizes):
         packed, expanded = _STREAM_SIZES.unpack_from(content, table + i * _STREAM_SIZES.size)
         fits = expanded == size and packed <= num_bytes - first
-        check(path, fits, f"{size} bytes in stream {i}, got {expanded} of {packed} in the file")
+        check(path, fits, f"{size} bytes in stream {i}, got {expanded} (compressed: {packed})")
         with value_errors(path, "a zstd stream that is not damaged"):
             reader = zstandard.ZstdDecompressor().stream_reader(content[first : first + packed])
             section = reader.read(size + 1)

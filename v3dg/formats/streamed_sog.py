@@ -1,8 +1,8 @@
-"""Streamed SOG, of PlayCanvas: `lod-meta.json` and folders of SOG; v3dg.export writes
-it.
+"""Streamed SOG, of PlayCanvas: `lod-meta.json` and folders with a SOG each. v3dg.export
+writes this format.
 
-Each leaf of a tree lists, for each level, which gaussians of which folder represent
-what is in its bounds.
+`lod-meta.json` has a tree of boxes. Each leaf lists, for each level of detail, the rows
+of gaussians in one of the folders that represent the content of its box.
 """
 
 import os
@@ -41,16 +41,16 @@ _LEVEL = re.compile(r"[0-9]{1,9}")
 
 
 class _Index(NamedTuple):
-    """What `lod-meta.json` says."""
+    """The content of `lod-meta.json`."""
 
     tree: Node
-    names: list[PurePosixPath]  # of the files that the tree refers to by number
-    environment: PurePosixPath | None  # the file of what belongs to no leaf
-    unread: list[str]  # fields that are not read
+    names: list[PurePosixPath]  # the files that the tree refers to by index
+    environment: PurePosixPath | None  # the file of gaussians that belong to no leaf
+    unread: list[str]  # names of ignored fields
 
 
 def open_file(path: str | os.PathLike[str]) -> AssetFile:
-    """Open a `lod-meta.json`; all is read with its first rows."""
+    """Open a `lod-meta.json`. The first read loads all gaussians."""
     path = Path(path)
     index = _index(path, Claims())
     finest = _used(path, index)
@@ -65,19 +65,21 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
 
 
 def _declared(index: _Index, parts: list[Declared]) -> Declared:
-    """Return what the index declares together with all of its parts."""
+    """Return what the index and all of its parts declare."""
     notes = list(dict.fromkeys(note for part in parts for note in part.notes))
     if index.unread:
-        notes.append(f"Fields of lod-meta.json were left out: {listed(index.unread)}.")
+        notes.append(f"Fields of lod-meta.json were ignored: {listed(index.unread)}.")
     antialiased = parts[0].antialiased
     if any(part.antialiased != antialiased for part in parts):
         antialiased = None
-        notes.append("Some folders were trained with antialiasing, others not or not known.")
+        notes.append(
+            "Some folders were trained with antialiasing, others were not or do not declare it."
+        )
     return Declared(antialiased=antialiased, notes=tuple(notes))
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the finest level of each leaf, and the environment, of a `lod-meta.json`."""
+    """Read a `lod-meta.json`: the finest level of each leaf, and the environment."""
     path = Path(path)
     claims = Claims()
     index = _index(path, claims)
@@ -85,10 +87,10 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     parts = []
     for name, rows in finest.items():
         gaussians = sog.read(path.parent / name, claims)
-        # Otherwise a small file could repeat rows any number of times.
+        # Without this check, a small file could repeat rows any number of times.
         count = len(gaussians)
         fits = sum(len(run) for run in rows) <= count and max(run.stop for run in rows) <= count
-        check(path, fits, f"at most {count} gaussians of {str(name)!a}, got more")
+        check(path, fits, f"at most {count} gaussians from {str(name)!a}, got more")
         parts.append(
             gaussians.subset(np.concatenate([np.arange(run.start, run.stop) for run in rows]))
         )
@@ -100,7 +102,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def files(path: Path) -> list[Path]:
-    """Return the index and the files of all levels and of the environment that
+    """Return the index and those files of all levels and of the environment that
     exist."""
     index = _index(path, Claims())
     names = dict.fromkeys([*index.names, index.environment])
@@ -109,11 +111,11 @@ def files(path: Path) -> list[Path]:
 
 
 def _used(path: Path, index: _Index) -> dict[PurePosixPath, list[range]]:
-    """Return the rows to read of each file, in the order of the files."""
+    """Return the rows that are read from each file, in the order of the files."""
     finest = _finest(index.tree, index.names)
     has_any = finest or index.environment is not None
-    check(path, has_any, "gaussians in the tree, got none")
-    # A file that is listed twice is read once.
+    check(path, has_any, "at least one gaussian in the tree, got none")
+    # A file that is listed twice is read only once.
     return {name: finest[name] for name in dict.fromkeys(index.names) if name in finest}
 
 
@@ -132,18 +134,20 @@ def _index(path: Path, claims: Claims) -> _Index:
 
 
 def _inside(node: Node) -> PurePosixPath:
-    """Return the path of a file in the folder of the index or below it; ValueError for
-    a path that leads out of it."""
+    """Return the path of a file in the folder of the index or below it; raise
+    ValueError for other paths."""
     path = PurePosixPath(node.text())
     if path.is_absolute() or ".." in path.parts or "\\" in node.text():
-        raise node.error("a path below that of lod-meta.json")
+        raise node.error("a path inside the folder of lod-meta.json")
     return path
 
 
 def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[range]]:
-    """For each file, the runs of gaussians that are the finest level of a leaf."""
+    """Return, for each file, the rows of gaussians that are the finest level of a
+    leaf."""
     runs: dict[PurePosixPath, list[range]] = {}
-    # Iterators, because a list of a million empty nodes would be as large as a scene.
+    # A list of a million empty nodes would need as much memory as a scene, so iterators
+    # are stacked.
     todo = [iter([tree])]
     while todo:
         node = next(todo[-1], None)
@@ -158,7 +162,7 @@ def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[
             continue
         levels = node.field("lods")
         if not isinstance(levels.value, dict) or not all(map(_LEVEL.fullmatch, levels.value)):
-            raise levels.error("levels by number")
+            raise levels.error("levels with integers as names")
         for level in sorted(levels.value, key=int):
             lod = levels.field(level)
             file = integer_of(lod.field("file"), f"0 to {len(names) - 1}", 0, len(names) - 1)

@@ -1,10 +1,10 @@
 """OpenUSD: gaussians as prims `ParticleField3DGaussianSplat`, with Pixar's usd-core.
 
-One prim is written. All prims are read and transformed, into one asset, or into an
-asset each with the poses of its instances. Of levels of detail, the first is read; of
-values that change with time, the first, too. What is invisible or for other purposes
-than drawing is left out. An asset is turned from the axes of the stage to those of
-memory; a world keeps the stage's.
+The writer writes one prim. The reader reads and transforms all prims, into one asset
+or, for a scene, into several assets with the poses of their instances. It reads the
+first of several levels of detail, and the first of values that change with time. It
+ignores prims that are invisible or not meant to be drawn. An asset is converted from
+the axes of the stage to those in memory; a scene keeps the axes of the stage.
 
 Source: Pixar, OpenUSD 26.11, the schemas of UsdVol, and Usdz File Format Specification.
 """
@@ -42,10 +42,11 @@ if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-# The axes of a stage by the one that is up; its cameras look back.
+# The axes of a stage by its up axis; the cameras of a stage look along -z.
 _AXES = {"Y": _axes.OPENGL, "Z": _axes.Z_UP}
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
-_ANTIALIASED = "antialiased"  # in the custom data of a prim: the schema has no place for it
+# Custom data of a prim, because the schema has no attribute for this.
+_ANTIALIASED = "antialiased"
 _SH = "radiance:sphericalHarmonics"
 _HALVES = (
     "positions",
@@ -63,15 +64,15 @@ _MOST_DEGREE = 100
 
 
 class _Kernel(Enum):
-    """The shapes of particles that can be read as gaussians."""
+    """The particle shapes that can be read as gaussians."""
 
     ELLIPSOID = "ParticleFieldKernelGaussianEllipsoidAPI"
-    SURFLET = "ParticleFieldKernelGaussianSurfletAPI"  # flat in its z
+    SURFLET = "ParticleFieldKernelGaussianSurfletAPI"  # flat along its z axis
 
 
 class _Column(NamedTuple):
-    """The values of an attribute for the particles of a prim; none if the default of
-    the schema stands for them."""
+    """The values of an attribute for the particles of a prim; None if the default of
+    the schema applies."""
 
     values: NDArray[np.float32] | None
     note: str = ""
@@ -79,7 +80,8 @@ class _Column(NamedTuple):
 
 @cache
 def pxr() -> ModuleType:
-    """Return the package `pxr`; ImportError says how to get it."""
+    """Return the package `pxr`; if it is missing, the ImportError says how to install
+    it."""
     for part in (
         "Usd",
         "UsdGeom",
@@ -87,14 +89,14 @@ def pxr() -> ModuleType:
         "UsdUtils",
         "UsdVol",
         "Vt",
-    ):  # importing them makes them attributes
+    ):  # importing these modules makes them attributes of the package
         _extras.load(f"pxr.{part}")
     package: ModuleType = _extras.load("pxr")
     return package
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a USD file, which is read whole."""
+    """Open a USD file. All of it is read at once."""
     gaussians, declared = read(path)
 
     def read_rows(first: int, last: int) -> Gaussians:
@@ -104,7 +106,8 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def read(path: AnyPath) -> tuple[Gaussians, Declared]:
-    """Read the gaussians of a USD file as one asset, and what the file declares."""
+    """Read the gaussians of a USD file as one asset, together with what the file
+    declares."""
     with _opened(path, "OpenUSD with gaussians, without instances") as (usd, root):
         for prim in _prims(usd, root):
             if prim.IsA(usd.UsdGeom.PointInstancer):
@@ -126,8 +129,8 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
 
 
 def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) -> Declared:
-    """Return what a stage declares, with the notes about its prims; `letter` is its
-    axis that is up."""
+    """Return what a stage declares, together with the notes about its prims; `letter`
+    is the stage's up axis."""
     unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
     distinct = list(dict.fromkeys(notes))
     if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
@@ -139,17 +142,18 @@ def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) 
 
 
 def has_instances(path: AnyPath) -> bool:
-    """Return whether instances make a USD file a scene."""
+    """Return whether a USD file has instances and is therefore a scene."""
     with _opened(path, "OpenUSD with gaussians") as (usd, root):
         kind = usd.UsdGeom.PointInstancer
         return any(prim.IsInstanceProxy() or prim.IsA(kind) for prim in _prims(usd, root))
 
 
 def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], Axis]:
-    """Read the distinct assets of a USD file, asset and pose of each instance, and the
-    axis that is up.
+    """Read a USD file as a scene: its distinct assets, the asset and the pose of each
+    instance, and the up axis.
 
-    Prims whose values come from the same place are one asset, as references to it are.
+    Prims whose values come from the same place in the file are one asset, for example
+    references to one prim.
     """
     asset_from_path: dict[Sdf.Path, int] = {}
     asset_from_source: dict[tuple[object, ...], int] = {}
@@ -171,15 +175,15 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
             asset_from_instance.append(asset_from_path[path_of_prim])
             poses.append(_similarity(prim, matrix))
         if not assets:
-            raise ValueError("no instances")
+            raise ValueError("no gaussians in it")
         up = usd.UsdGeom.GetStageUpAxis(root.GetStage()).lower()
         return assets, asset_from_instance, poses, up
 
 
 @contextlib.contextmanager
 def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim]]:
-    """Yield the package `pxr`, and the root of the prims of a file; ValueError if no
-    prim has gaussians."""
+    """Yield the package `pxr` and the root prim of a file; raise ValueError if no prim
+    has gaussians."""
     check(
         path, Path(path).suffix.lower() in SUFFIXES, f"a file name ending in {', '.join(SUFFIXES)}"
     )
@@ -196,8 +200,8 @@ def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim
 
 
 def _check_package(path: AnyPath) -> None:
-    """Raise ValueError unless a file is a zip of a layer, and other files, that are
-    stored as they are: the library reads them in place."""
+    """Raise ValueError unless a file is a zip that begins with a USD layer and whose
+    members are all uncompressed: the library reads them in place."""
     with value_errors(path, "a .usdz, which is a zip"), zipfile.ZipFile(path) as package:
         members = package.infolist()
     is_layer = bool(members) and members[0].filename.endswith(SUFFIXES[:3])
@@ -206,18 +210,19 @@ def _check_package(path: AnyPath) -> None:
     for member in members:
         is_stored = member.compress_type == zipfile.ZIP_STORED and not member.flag_bits & 1
         has_size = member.compress_size == member.file_size
-        expected = f"{member.filename!a} stored in the .usdz as it is"
-        check(path, is_stored and has_size, f"{expected}, got a compressed or an encrypted file")
+        expected = f"{member.filename!a} uncompressed in the .usdz"
+        check(path, is_stored and has_size, f"{expected}, got compressed or encrypted data")
 
 
 def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
-    """Yield the prims of gaussians, and the instancers, that are to be drawn at and
-    below a root; coarser levels are left out."""
+    """Yield all prims of gaussians and all instancers at or below a root that are meant
+    to be drawn; coarser levels of detail are skipped."""
     walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
     for prim in walk:
         is_instancer = prim.IsA(usd.UsdGeom.PointInstancer)
         is_left_out = _is_coarse(usd, prim) or _is_hidden(usd, prim)
-        if is_instancer or is_left_out:  # prims below an instancer are only drawn as its instances
+        # Prims below an instancer are drawn only as its instances.
+        if is_instancer or is_left_out:
             walk.PruneChildren()
         if not is_left_out and (is_instancer or _kernel(usd, prim) is not None):
             yield prim
@@ -230,8 +235,8 @@ def _is_coarse(usd: ModuleType, prim: Usd.Prim) -> bool:
 
 
 def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
-    """Return whether a prim and all below it are not drawn, because it is invisible, a
-    stand-in for others, or an aid for editing."""
+    """Return whether a prim and everything below it are not drawn: invisible prims,
+    proxies, and guides for editing."""
     imageable = usd.UsdGeom.Imageable(prim)
     if not imageable:
         return False
@@ -242,7 +247,8 @@ def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
 
 
 def _kernel(usd: ModuleType, prim: Usd.Prim) -> _Kernel | None:
-    """Return the shape of a prim's particles; None if they are not gaussians."""
+    """Return the shape of a prim's particles; None if the particles are not
+    gaussians."""
     if prim.IsA(usd.UsdVol.ParticleField):
         for kernel in _Kernel:
             if prim.HasAPI(getattr(usd.UsdVol, kernel.value)):
@@ -251,7 +257,7 @@ def _kernel(usd: ModuleType, prim: Usd.Prim) -> _Kernel | None:
 
 
 def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
-    """Return a sentence for each part of the stage that is not read."""
+    """Return a sentence for each part of the stage that is ignored."""
     hidden: list[str] = []
     particles: list[str] = []
     unread: list[str] = []
@@ -270,18 +276,19 @@ def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
     notes = []
     if hidden:
         notes.append(
-            f"Prims that are invisible or not for drawing were left out: {listed(hidden)}."
+            f"Prims that are invisible or not meant to be drawn were ignored: {listed(hidden)}."
         )
     if particles:
-        notes.append(f"Particles that are no gaussians were left out: {listed(particles)}.")
+        notes.append(f"Particles that are not gaussians were ignored: {listed(particles)}.")
     if unread:
-        notes.append(f"Other geometry was left out: {listed(unread)}.")
+        notes.append(f"Other geometry was ignored: {listed(unread)}.")
     return notes
 
 
 def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]]:
-    """Yield each prim of gaussians with the (4, 4) matrix from the prim, or from an
-    instance of it, to the root."""
+    """Yield each prim of gaussians with a (4, 4) matrix from the coordinates of the
+    prim to those of the root. A prim with instances is yielded once for each
+    instance."""
     root_from_world = np.linalg.inv(_to_world(usd, root))
     time = usd.Usd.TimeCode.EarliestTime()
     for prim in _prims(usd, root):
@@ -303,14 +310,14 @@ def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]
 
 
 def _to_world(usd: ModuleType, prim: Usd.Prim) -> Floats:
-    # USD multiplies row vectors by matrices.
+    # Transposed, because USD multiplies row vectors by matrices.
     cache = usd.UsdGeom.XformCache(usd.Usd.TimeCode.EarliestTime())
     return np.transpose(np.array(cache.GetLocalToWorldTransform(prim)))
 
 
 def _similarity(prim: Usd.Prim, matrix: Floats) -> _Pose:
     """Return the quaternion, the translation and the scale of a (4, 4) matrix that
-    places a prim."""
+    places a prim; raise ValueError for other transforms."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
         raise ValueError(
@@ -321,8 +328,8 @@ def _similarity(prim: Usd.Prim, matrix: Floats) -> _Pose:
 
 
 def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]]:
-    """Return the gaussians of a prim, and notes on values that were read otherwise than
-    they are written."""
+    """Return the gaussians of a prim, and notes about values that are ignored or
+    converted."""
     means = _column(usd, prim, "positions", None).values
     if means is None:
         means = np.zeros((0, 3), np.float32)
@@ -334,7 +341,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
     harmonics = _column(usd, prim, f"{_SH}Coefficients", count * (degree + 1) ** 2)
     notes = [column.note for column in (*columns.values(), harmonics) if column.note]
     notes += _notes_of(usd, prim)
-    # The defaults of the schema, where an attribute is absent or ignored.
+    # Absent or ignored attributes have the defaults of the schema.
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
     if columns["orientations"].values is not None:
         quats = np.roll(columns["orientations"].values, 1, axis=1)
@@ -351,7 +358,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
     if harmonics.values is not None:
         sh = harmonics.values.reshape(count, (degree + 1) ** 2, 3)
     if degree > _MAX_DEGREE:
-        notes.append(f"Coefficients above SH degree {_MAX_DEGREE} were left out.")
+        notes.append(f"Coefficients above SH degree {_MAX_DEGREE} were ignored.")
         sh = sh[:, : (_MAX_DEGREE + 1) ** 2]
     gaussians = Gaussians(
         means=means,
@@ -371,18 +378,19 @@ def _antialiased(prim: Usd.Prim) -> bool | None:
 
 
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
-    """Return the SH degree of a prim, which is 3 by default."""
+    """Return the SH degree of a prim; the default of the schema is 3."""
     degree = _value(usd, prim, f"{_SH}Degree")
-    if degree is None:  # the prim has no coefficients either
+    if degree is None:  # then the prim has no coefficients either
         return 0
     if not isinstance(degree, int) or not 0 <= degree <= _MOST_DEGREE:
-        raise ValueError(f"the SH degree {degree} in {prim.GetPath()}")
+        raise ValueError(f"an invalid SH degree, {degree}, in {prim.GetPath()}")
     return degree
 
 
 def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _Column:
-    """Return the first `count` values of an attribute in single precision, or else in
-    half precision; the schema ignores an attribute with fewer values."""
+    """Return the first `count` values of an attribute in single precision or, if it is
+    missing, of its variant in half precision. The schema ignores an attribute with
+    fewer values."""
     stored = _value(usd, prim, name)
     if stored is None:
         stored = _value(usd, prim, f"{name}h")
@@ -393,13 +401,13 @@ def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _C
         return _Column(values)
     lengths = f"{len(values)} values of {name} for {count} in {prim.GetPath()}"
     if len(values) < count:
-        return _Column(None, f"{lengths} are too few, so the schema's default was used.")
-    return _Column(values[:count], f"{lengths} are too many, so the last ones were left out.")
+        return _Column(None, f"{lengths} are too few, so the default of the schema was used.")
+    return _Column(values[:count], f"{lengths} are too many, so the last values were ignored.")
 
 
 def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
-    """Return the first value of an attribute; None if the prim has none, or no such
-    attribute."""
+    """Return the first value of an attribute; None if the prim does not have the
+    attribute or a value for it."""
     attribute = prim.GetAttribute(name)
     if not attribute:
         return None
@@ -407,31 +415,32 @@ def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
 
 
 def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
-    """Return a sentence for everything else that a prim says about its gaussians."""
+    """Return sentences about other properties of a prim's gaussians that are
+    ignored."""
     notes = []
     authored = prim.GetAuthoredAttributes()
     is_moving = usd.UsdGeom.Xformable(prim).TransformMightBeTimeVarying() or any(
         attribute.GetNumTimeSamples() > 1 for attribute in authored
     )
     if is_moving:
-        notes.append("Values change with time, and were read at the first one.")
+        notes.append("Values change with time; the first ones were read.")
     for name in _HINTS:
         attribute = prim.GetAttribute(name)
         if attribute and attribute.HasAuthoredValue():
             value = str(attribute.Get())
             default = str(prim.GetPrimDefinition().GetAttributeFallbackValue(name))
             if value != default:
-                notes.append(f"The hint {name} is {value[:40]!a}, which was left out.")
+                notes.append(f"The hint {name} is {value[:40]!a} and was ignored.")
     names = [attribute.GetName() for attribute in authored]
     unread = [name for name in names if name not in _KNOWN and not name.startswith("xformOp:")]
     if unread:
-        notes.append(f"Attributes of gaussians were left out: {listed(unread)}.")
+        notes.append(f"Attributes of gaussians were ignored: {listed(unread)}.")
     return notes
 
 
 def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> None:
-    """Write a USD file of one prim, of gaussians of which `up` is up; the order
-    stays."""
+    """Write a USD file with one prim, in the order of the gaussians. `up` is the axis
+    of the gaussians that points up."""
     host = _axes.turned(check_writable(gaussians), _axes.axes_of_up(up), _AXES["Y"])
     stage = new_stage("Y")
     stage.SetDefaultPrim(define(stage, "/gaussians", host))
@@ -439,7 +448,7 @@ def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) ->
 
 
 def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
-    """Return an empty stage in metres; Y is USD's default for the axis that is up."""
+    """Return an empty stage in metres; `up` is the axis that points up."""
     usd = pxr()
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, up)
@@ -448,10 +457,10 @@ def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
 
 
 def export(stage: Usd.Stage, path: AnyPath) -> None:
-    """Write a stage to a file in one step, in the encoding that belongs to the
-    suffix."""
+    """Write a stage to a file, which appears only when it is complete. The suffix
+    selects the encoding."""
     with _files.replacing(path) as temporary, tempfile.TemporaryDirectory() as folder:
-        # USD takes the encoding from the suffix.
+        # USD chooses the encoding by the suffix of the file.
         suffix = Path(path).suffix.lower()
         layer = Path(folder) / f"stage{suffix}"
         if suffix == ".usdz":
@@ -469,7 +478,8 @@ def export(stage: Usd.Stage, path: AnyPath) -> None:
 
 
 def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
-    """Define a prim of gaussians on a stage; ``host`` has passed `check_writable`."""
+    """Define a prim of gaussians on a stage; ``host`` must have passed
+    `check_writable`."""
     usd = pxr()
     prim = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, path).GetPrim()
     reach = 3 * host.scales.max(axis=1, keepdims=True, initial=0.0)

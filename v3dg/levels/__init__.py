@@ -1,5 +1,5 @@
-"""Build a bundle from an asset: split the asset into clusters, then halve and fit them
-level after level."""
+"""Build a bundle from an asset: divide the asset into clusters, then make coarser
+levels by repeatedly halving the number of gaussians and fitting the result."""
 
 import os
 from concurrent.futures import Executor
@@ -71,9 +71,9 @@ def build_bundle(
         quality: "draft" leaves the levels as they are built. "standard" then refines
             them together (`v3dg.refine_bundle`) with 20,000 pictures and one more for
             every 50 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
-            "best" uses five times as many. The levels at `resume_path` stay unrefined,
-            and the refined bundle is in memory. A place that is seen from inside needs
-            `v3dg.refine_bundle` with cameras instead.
+            "best" uses five times as many pictures. The levels at `resume_path` stay
+            unrefined, and the refined bundle is in memory. For a place that is seen
+            from inside, such as a room, use `v3dg.refine_bundle` with cameras instead.
 
     Raises:
         ValueError: The asset has no gaussian that can be drawn, or a setting is wrong.
@@ -93,7 +93,12 @@ def build_bundle(
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
     has_place = executor is None or resume_path is not None
-    check("resume_path", has_place, "a file that all workers of the executor reach, got None")
+    check(
+        "resume_path",
+        has_place,
+        "a file on a disk that all workers of the executor share, got None; give the path of the "
+        "bundle",
+    )
     config = leaves.settings(config)
     return build_into(
         resume_path,

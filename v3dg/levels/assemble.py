@@ -24,8 +24,8 @@ def assemble(
     level = np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters)
     last_px2 = 0.0
     if config.filter_px2 > 0 or config.smooth == "yes":
-        # The last level is also drawn at all smaller sizes. Its filter has the variance
-        # of a whole pixel, 1/12.
+        # The last level is also drawn at all smaller sizes, so the variance of its
+        # filter is at least that of a box of one pixel, 1/12 px².
         last_px2 = max(config.filter_px2, 1 / 12)
     coarse_px2 = np.where(level < len(levels) - 1, config.filter_px2, last_px2)
     antialiased = np.ones(len(level), np.uint8)
@@ -55,10 +55,11 @@ def assemble(
 def _groups_from(
     counts: Sequence[int], num_groups: Sequence[int], num_up: int
 ) -> npt.NDArray[np.int32]:
-    """Return the group, `num_up` levels up, of each of the `counts` rows of every
-    level; -1 if there is none.
+    """Return, for each row of every level, the group `num_up` levels higher that
+    contains it; -1 without such a group.
 
-    All groups of a level have the same number of rows.
+    The rows are clusters or groups; `counts` has their number for each level. Each
+    group of a level contains the same number of rows.
     """
     first_group = np.cumsum([0, *num_groups])
     parts = []

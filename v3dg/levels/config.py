@@ -7,17 +7,19 @@ from typing import Annotated, Literal, NoReturn, get_args, get_origin
 from v3dg._numbers import check, refuse
 from v3dg.gaussians import TRAINED_FILTER_PX2
 
-# Drawing a target cannot be interrupted; this limit keeps it below about a second.
+# Maximum side of a target picture, px. Drawing one cannot be interrupted; up to this
+# size it takes less than about a second.
 _MOST_SIDE = 8192
-# Samples along a pixel's side in targets of deep levels; more samples gain nothing.
+# Maximum number of samples along the side of a pixel in target pictures; more do not
+# improve the fits.
 _MOST_SAMPLES = 8
-_DEEP = 64  # a level whose targets have this many samples
+_DEEP = 64  # a level deep enough to use `_MOST_SAMPLES`
 # Limit on the pixels of all views of a group together. Each thread that fits a group
 # stores them, 16 bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
-# The classes that values of a setting may have, by the type of the setting, and their
-# names in messages.
+# For each type of a setting: the Python types that are accepted, and what error
+# messages call them.
 _KINDS: dict[type, tuple[tuple[type, ...], str]] = {
     int: ((int,), "a whole number"),
     float: ((int, float), "a number"),
@@ -39,10 +41,12 @@ class BuildConfig:
 
     Attributes:
         cluster_size: Maximum number of gaussians in a cluster of level 0.
-        group_size: Number of clusters that are simplified together, a power of two; 2
-            makes a tree.
-        min_clusters: Levels stop before there are fewer clusters than this ...
-        min_gaussians: ... or fewer gaussians than this.
+        group_size: Number of clusters that are simplified together, a power of two.
+            With 2, the groups form a binary tree.
+        min_clusters: Minimum number of clusters in a level; coarser levels are not
+            built.
+        min_gaussians: Minimum number of gaussians in a level; coarser levels are not
+            built.
         init: How a coarser cluster is initialised: "merge" similar gaussians in pairs,
             or "prune" the less important half.
         prune_growth: Factor for the scales of gaussians that survive pruning.
@@ -60,33 +64,34 @@ class BuildConfig:
             show finer gaussians. With targets of the previous level it does not grow.
         image_size: Side of the views in px; 0 shows a group at the size at which it is
             selected.
-        px2_per_gaussian: The size at which a group is shown: px² of its footprint per
-            gaussian that it is simplified to.
+        px2_per_gaussian: The size at which views show a group: px² of its footprint for
+            each gaussian that it is simplified to.
         distance: Distance from the camera to the centre of the group, in radii of the
             group.
         filter_px2: Variance, px², of the low-pass filter of the coarser levels. The
             last level has at least the variance of a pixel, 1/12, unless this is 0.
         smooth: Whether the asset is smooth: its gaussians are about as wide as the
-            distances between them, so that one sample per pixel suffices from near.
-            Coarser levels of a smooth asset have no filter, except the last one, which
-            has that of a pixel. A group of level 1 is then selected where pictures of
-            the asset show that it looks no worse than its leaves, or at half the size
-            if there are more than a million leaves. With "measured", and if levels are
-            fitted with a filter, a measurement decides: some groups of level 1 are
-            fitted with 0.05 px² and without a filter, and the asset is smooth if the
-            filter hardly improves it.
+            distances between them, so that one sample per pixel suffices when they are
+            seen from near. Coarser levels of a smooth asset have no filter, except the
+            last one, which has that of a pixel. A group of level 1 is then selected
+            where pictures of the asset show that it looks no worse than its leaves, or
+            at half the size if there are more than a million leaves. With "measured",
+            and if levels are fitted with a filter, a measurement decides: some groups
+            of level 1 are fitted with 0.05 px² and without a filter, and the asset is
+            smooth if the filter hardly improves it.
         asset_filter_px2: The filter of level 0. None means no filter, or the filter of
             the training if the asset is antialiased. The filter used for training (0.3
             for the original 3DGS) suits pictures of the size of the photographs;
             without a filter, the asset looks better from farther away. Coarser levels
             are always fitted to the asset without a filter.
         asset_antialiased: Whether the asset was trained with opacities that compensate
-            for its filter. None means what the asset says (`Gaussians.antialiased`),
-            and False if it says nothing.
+            for its filter. None uses the asset's own value (`Gaussians.antialiased`),
+            or False if that is None.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
         step_position: Step size of positions, in radii of the group, or in world units
-            if `position_in_world`. The other step sizes are those of log scales,
-            quaternions, logits and SH coefficients.
+            if `position_in_world`. `step_log_scale`, `step_quat`, `step_logit`,
+            `step_sh0` and `step_sh_rest` are the step sizes of log scales, quaternions,
+            opacity logits, and SH coefficients of degree 0 and of higher degrees.
         final_step: The factor by which the step sizes have decayed exponentially at the
             last step.
         beta2: Decay of Adam's running mean of squared gradients.
@@ -98,24 +103,28 @@ class BuildConfig:
 
     cluster_size: Annotated[int, (2, 1 << 30)] = 256
     group_size: Annotated[int, (2, 1 << 30)] = 2
-    # The core does not read these counts. With the largest value, level 0 is the only
-    # level.
+    # Only Python code reads these counts, so they may exceed 32 bits. With the largest
+    # values, level 0 is the only level.
     min_clusters: Annotated[int, (1, 1 << 62)] = 1
     min_gaussians: Annotated[int, (1, 1 << 62)] = 1
     init: Literal["merge", "prune"] = "merge"
-    prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)  # applied once per level
+    # The growth of one level.
+    prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)
     targets: Literal["finest", "previous"] = "finest"
-    steps: Annotated[int, (0, 1_000_000)] = 600  # the largest value takes some hours
+    # A fit with the largest value takes hours.
+    steps: Annotated[int, (0, 1_000_000)] = 600
     first_steps: Annotated[int, (0, 1_000_000)] = 150
-    views_per_step: Annotated[int, (1, 1024)] = 2  # a step cannot be interrupted
-    num_views: Annotated[int, (0, 1 << 16)] = 64  # all are drawn before the first step
-    # More samples than a pixel has distinct values gain nothing.
+    # Bounded because a step cannot be interrupted.
+    views_per_step: Annotated[int, (1, 1024)] = 2
+    # All views are drawn before the first step.
+    num_views: Annotated[int, (0, 1 << 16)] = 64
+    # Up to 64 x 64 samples are averaged in each pixel.
     supersample: Annotated[int, (1, 64)] = 3
     image_size: Annotated[int, (0, _MOST_SIDE)] = 0
-    # At most, every gaussian fills a picture.
+    # At the upper bound, a gaussian covers about 1000 x 1000 px.
     px2_per_gaussian: Annotated[float, (0.001, 1_000_000)] = 2.0
-    # The camera is outside of the ball. At larger distances, float32 depths are coarser
-    # than gaussians.
+    # The lower bound keeps the camera outside the ball. Beyond the upper bound, float32
+    # depths are spaced more widely than gaussians are.
     distance: Annotated[float, (1.1, 1000)] = 4.0
     filter_px2: _Weight = 0.05
     smooth: Literal["measured", "yes", "no"] = "measured"
@@ -178,8 +187,9 @@ class BuildConfig:
         check(
             name,
             fits,
-            f"views of at most {_MOST_SIDE} px a side with `supersample`, and {_MOST_PIXELS_KEPT} "
-            f"px in all `num_views`, got {side} px a side; reduce one of them, or `cluster_size`",
+            f"views of at most {_MOST_SIDE} px a side after multiplication by `supersample`, and "
+            f"at most {_MOST_PIXELS_KEPT} px in all `num_views` together, got views of {side} px "
+            f"a side; reduce `supersample`, `num_views`, `{name}` or `cluster_size`",
         )
 
     def _view_side(self, num_gaussians: int) -> int:
@@ -195,7 +205,8 @@ class BuildConfig:
         return min(self.steps, self.first_steps << min(max(level - 1, 0), 32))
 
     def samples_at(self, level: int) -> int:
-        """Return the factor by which the targets of a level are drawn larger."""
+        """Return the number of samples along the side of a pixel in the target pictures
+        of a level."""
         if self.targets == "previous":
             return self.supersample
         return max(self.supersample, min(self.supersample + (level - 1) // 2, _MOST_SAMPLES))
@@ -226,15 +237,16 @@ class BuildConfig:
 
     @property
     def _visible_levels(self) -> int:
-        """The number of levels down to gaussians about as small as half a sample
-        of a target picture."""
+        """The number of levels below a level whose detail its target pictures show:
+        down to gaussians about as small as half a sample."""
         px2 = self.px2_per_gaussian
         if self.image_size > 0:  # the ball covers about 0.4 of the picture
             px2 = 0.4 * self.image_size**2 / (self.cluster_size * self.group_size / 2)
         return 1 + max(1, math.ceil(math.log2(px2 * self.supersample**2)))
 
     def of_asset(self, *, antialiased: bool | None) -> "BuildConfig":
-        """The settings for an asset that says, or does not, that it is antialiased."""
+        """Return these settings with the filter of an asset filled in; `antialiased` is
+        the asset's own declaration, None without one."""
         if self.asset_antialiased is not None:
             antialiased = self.asset_antialiased
         filter_px2 = self.asset_filter_px2
@@ -245,19 +257,25 @@ class BuildConfig:
         return replace(self, asset_antialiased=bool(antialiased), asset_filter_px2=filter_px2)
 
     def contradiction(self, *, antialiased: bool | None) -> str:
-        """What differs between these settings and what an asset says of itself, as a
-        sentence; empty if nothing does."""
+        """Return a description of the contradiction between these settings and the
+        asset's own declaration; empty if they agree."""
         setting = self.asset_antialiased
         if setting is None or antialiased is None or setting == antialiased:
             return ""
         if antialiased:
-            return "It says that it was trained with antialiasing, but is built without."
-        return "It says that it was trained without antialiasing, but is built with it."
+            return (
+                "declared as trained with antialiasing, but built with asset_antialiased=False; "
+                "omit that setting to use the declaration"
+            )
+        return (
+            "declared as trained without antialiasing, but built with asset_antialiased=True; "
+            "omit that setting to use the declaration"
+        )
 
     @property
     def asset_look(self) -> tuple[float, bool]:
-        """The filter of level 0, px², and whether its opacities are compensated for
-        it."""
+        """The variance of the filter of level 0, px², and whether the opacities
+        compensate for that filter."""
         config = self.of_asset(antialiased=None)
         return config.asset_filter_px2 or 0.0, bool(config.asset_antialiased)
 

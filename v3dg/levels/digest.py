@@ -11,15 +11,15 @@ from v3dg.gaussians import Gaussians
 
 PIECE = 1 << 16
 """Number of gaussians that are read, examined and hashed at a time. The digest of an
-asset depends on it."""
+asset depends on this number."""
 
 
 def digest_of(asset: Gaussians) -> str:
     """Return the digest of an asset, which does not depend on the file that it was read
     from."""
     pieces = pieces_of(asset.numpy())
-    # Hashing a few pieces costs less than starting threads, which Python does not do
-    # safely when memory is short.
+    # A few pieces are hashed faster than threads start, and starting threads can fail
+    # when memory is short.
     if len(pieces) <= 3:
         return digest_of_hashes(map(hash_of, pieces))
     with new_pool() as pool:
@@ -38,8 +38,8 @@ def hash_of(piece: Gaussians) -> bytes:
 
 
 def digest_of_hashes(hashes: Iterable[bytes]) -> str:
-    """Return the digest of an asset from the hashes of its pieces, which threads can
-    compute in parallel."""
+    """Combine the hashes of all pieces, in order, to the digest of the asset. The
+    hashes can be computed in parallel."""
     return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
 
 

@@ -14,7 +14,8 @@ from v3dg import _core
 from v3dg.levels.scratch import RowFile
 
 Points = npt.NDArray[np.uint32]
-"""(N, 4): the bits of x, y and z, and the index."""
+"""(N, 4): the bits of the float32 coordinates x, y and z, and the index of the
+point."""
 
 Words = npt.NDArray[np.uint32]
 WordFile = RowFile[np.uint32]
@@ -32,11 +33,11 @@ def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) ->
 def split(
     files: tuple[WordFile, WordFile], count: int, depth: int, num_fitting: int, order: WordFile
 ) -> None:
-    """Write the indices of points in the order of `_core.median_split`; both give the
-    same bits.
+    """Write the indices of points to `order`, in the same order as
+    `_core.median_split`, bit for bit.
 
-    The first `count` rows of one file are the points, finite and by ascending index;
-    the other file is temporary memory for passes.
+    The first `count` rows of the first file are the points; they must be finite and in
+    ascending order of their indices. The second file holds temporary data.
     """
     todo = [(0, count, depth, 0)]
     while todo:
@@ -85,12 +86,13 @@ def _longest_axis(source: WordFile, first: int, last: int) -> int:
         means = points[:, :3].view(np.float32)
         low = np.minimum(low, means.min(axis=0))
         high = np.maximum(high, means.max(axis=0))
-    return int(np.argmax(high - low))  # ties go to the first side, in float32, as in the core
+    # As in the core: float32 lengths, and of equal sides the first.
+    return int(np.argmax(high - low))
 
 
 def _median(source: WordFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
     """Return the greatest key of the lower half, in the order of `_ordered`, and how
-    many points of the lower half have it."""
+    many points of the lower half have this key."""
 
     def keys() -> Iterator[Words]:
         return (_ordered(points[:, axis]) for points in source.blocks(first, last, _AT_ONCE))
@@ -102,8 +104,8 @@ def _median(source: WordFile, first: int, middle: int, last: int, axis: int) -> 
 
 
 def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
-    """Return the 16-bit value of a rank, counted from 1, and its rank among equal
-    values."""
+    """Return the 16-bit value at a rank, counted from 1, in ascending order, and the
+    rank among the values that equal it."""
     counts = np.zeros(1 << 16, np.int64)
     for block in values:
         counts += np.bincount(block, minlength=1 << 16)

@@ -162,7 +162,8 @@ class _FileBuild:
         with source as leaves:
             config = leaves.settings(self.config)
             if resume and self._is_finished(leaves, config):
-                with suppress(RuntimeError):  # another build is writing there
+                # RuntimeError: another build is writing there.
+                with suppress(RuntimeError):
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
             self._check_memory(leaves)
@@ -183,14 +184,15 @@ class _FileBuild:
             return bundle, True
 
     def _check_memory(self, leaves: Leaves) -> None:
-        """Refuse, before the build, an asset that is too large to be refined."""
+        """Raise ValueError before the build if its refinement would need too much
+        memory."""
         count = leaves.num_gaussians
         required = refine_bytes(self.quality, count, leaves.sh_degree)
         check(
             "memory",
             self.num_bytes >= required,
-            f"at least {in_mib(required)} to refine an asset of {count:,} gaussians, "
-            f"got {in_mib(self.num_bytes)}; give more, or build with the quality draft",
+            f"at least {in_mib(required)} to refine an asset of {count:,} gaussians, got "
+            f"{in_mib(self.num_bytes)}; allow more memory, or build with quality 'draft'",
         )
 
     def _is_finished(self, leaves: Leaves, config: BuildConfig) -> bool:
@@ -223,6 +225,7 @@ def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
     """Return the file in which `build_file` builds the bundle, and from which an
     interrupted build continues."""
     path = Path(bundle_path)
-    if path.is_symlink():  # the file is beside the link's target, which it will replace
+    # The new file replaces the link's target, so it is beside that.
+    if path.is_symlink():
         path = Path(os.path.realpath(path))
     return path.with_name(path.name + ".partial")

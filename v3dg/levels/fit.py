@@ -57,7 +57,7 @@ def run_fit(
     has_ended = threading.Event()
 
     def work(token: _Token) -> None:
-        del token  # the frame of the thread still refers to it
+        del token  # the running thread itself keeps its arguments alive until it ends
         try:
             run()
         except BaseException as error:
@@ -82,7 +82,9 @@ def run_fit(
     if failure:
         raise failure[0]
     if not has_ended.is_set():
-        raise MemoryError("a new thread ended at once, for lack of memory")
+        raise MemoryError(
+            "thread: ended at once because memory is short; free some memory and try again"
+        )
     show(state)
     return result[0]
 

@@ -21,6 +21,7 @@ from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.digest import digest_of
+from v3dg.levels.rows import RUN_ROWS
 
 Unusable = Literal["drop", "refuse"]
 
@@ -34,13 +35,13 @@ class Leaves(ABC):
     sh_degree: int
     dropped: dict[str, int]
     digest: str
-    resident_bytes: int  # memory of the host that they need as long as they are read
-    up: Axis | None  # what is up, if the file of the asset declares it
+    resident_bytes: int  # host memory that the leaves occupy while they are read
+    up: Axis | None  # the axis that points up, if the asset's file declares it
     antialiased: bool | None  # as in `Gaussians`
 
     def settings(self, config: BuildConfig) -> BuildConfig:
-        """The settings with which they are built; an AssetWarning says where these
-        contradict the asset."""
+        """Return the settings of a build of these leaves; emit an AssetWarning if
+        `config` contradicts what the asset declares."""
         contradiction = config.contradiction(antialiased=self.antialiased)
         if contradiction:
             warnings.warn(f"asset: {contradiction}", cleaning.AssetWarning, stacklevel=3)
@@ -52,8 +53,8 @@ class Leaves(ABC):
 
 
 class MemoryLeaves(Leaves):
-    """The leaves of an asset in memory, on any device. The first call of `read` splits
-    them, on `device`."""
+    """The leaves of an asset in memory, on any device. The first call of `read` sorts
+    them by a median split, on `device`."""
 
     def __init__(
         self,
@@ -80,7 +81,7 @@ class MemoryLeaves(Leaves):
             up=up or declared_of(asset).up,
             antialiased=asset.antialiased,
         )
-        self._asset = _device.place(asset, _device.of(asset.means))  # without gradients
+        self._asset = _device.place(asset, _device.of(asset.means))  # drops gradients
         self._config = config
         self._device = device
         self._order: npt.NDArray[np.int32] | npt.NDArray[np.int64] | None = None
@@ -103,14 +104,16 @@ class MemoryLeaves(Leaves):
 def made_with(
     leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None
 ) -> JsonObject:
-    """Return the config of a bundle: the asset and the settings it is built from."""
+    """Return the config that a bundle stores: the number, the digest and the faults of
+    the asset's gaussians, and the settings of the build."""
     seed = whole_number(seed, "seed")
-    check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {value_text(seed)}")
+    check("seed", 0 <= seed < 2**58, f"a whole number from 0 to 2^58 - 1, got {value_text(seed)}")
     result: JsonObject = {
         "build": asdict(config),
         "seed": seed,
         "asset_gaussians": leaves.asset_gaussians,
         "asset_digest": leaves.digest,
+        "run_rows": RUN_ROWS,
         "dropped": leaves.dropped,
     }
     if codec != Codec.name:
@@ -122,7 +125,8 @@ def made_with(
 
 
 class Tally:
-    """Counts the gaussians of an asset, which is examined in parts."""
+    """Counts the gaussians of an asset, and the faults of those that cannot be drawn,
+    one part of the asset at a time."""
 
     def __init__(self) -> None:
         self.num_gaussians = 0
@@ -151,7 +155,11 @@ class Tally:
         )
         check("asset", self.num_gaussians, "at least one gaussian, got none")
         is_allowed = not self.num_wrong or unusable != "refuse"
-        check("asset", is_allowed, f"gaussians that can be drawn, got others: {text}")
-        check("asset", self.num_drawable, f"a gaussian that can be drawn, got none: {text}")
+        check(
+            "asset",
+            is_allowed,
+            f"only gaussians that can be drawn, but {text}; unusable='drop' leaves them out",
+        )
+        check("asset", self.num_drawable, f"at least one gaussian that can be drawn, but {text}")
         if self.num_wrong:
             warnings.warn(f"asset: {text}; they are left out", cleaning.AssetWarning, stacklevel=4)

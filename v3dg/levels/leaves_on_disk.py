@@ -3,7 +3,8 @@
 An asset that does not fit in memory is read twice, in blocks. The first pass writes its
 means to scratch files, where they are split (`external_split`) down to *buckets*: nodes
 that are small enough to be sorted when they are read. The second pass writes every
-gaussian to its bucket. docs/results.md has the amounts of data.
+gaussian to its bucket. docs/results.md lists the amounts of data that are read and
+written.
 """
 
 import math
@@ -43,9 +44,12 @@ MOST_GAUSSIANS = 1 << 32
 _MOST_IN_BUCKET = 1 << 18  # a quarter of a build unit, so that few unneeded gaussians are read
 # Larger blocks are not faster, because their rows are read in random order.
 _MOST_IN_BLOCK_BYTES = 1 << 28
-_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket together
+_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket at a time
 _OVERHEAD_BYTES = 24 << 20
-_CHANGED = "a file that does not change while it is read, got another content; build again"
+_CHANGED = (
+    "a file that does not change during the build, got different content when it was read again; "
+    "build again"
+)
 _NAMES = ("points", "spare", "order", "rows")
 
 _Blocks = Iterator[tuple[int, Gaussians]]
@@ -93,19 +97,19 @@ def leaves_on_disk(
     progress: Progress = False,
     most_in_memory: int = MOST_GAUSSIANS,
 ) -> Iterator[Leaves]:
-    """Return the leaves of the asset that consists of the gaussians in some files,
+    """Return the leaves of the asset that the gaussians of all files form together,
     using at most `memory` bytes.
 
-    Their order is that of the median split of all of them and does not depend on the
-    memory. `reserved` returns the memory that other work needs, given the number of
-    gaussians and the SH degree. An asset of more than `most_in_memory` gaussians is
-    sorted on disk even if it fits in memory. The scratch folder is created only if
-    needed, and removed at the end.
+    The leaves are in the order of the median split of the whole asset, which does not
+    depend on the memory. `reserved` returns the memory that other work needs, given the
+    number of gaussians and the SH degree. An asset of more than `most_in_memory`
+    gaussians is sorted on disk even if it fits in memory. The scratch folder is created
+    only if it is needed, and removed at the end.
     """
     files = map(open_asset, paths)  # lazy, so that few files are open at once
     tiles = list(map(_Tile.of, files))
     count = sum(tile.num_gaussians for tile in tiles)
-    check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
+    check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}; divide it")
     degree = max(tile.sh_degree for tile in tiles)
     sizes = _Sizes.of(memory, reserved(count, degree), degree, tiles)
     folder = Path(folder)
@@ -143,7 +147,7 @@ def _check_disk(folder: Path, num_bytes: int) -> None:
 
 
 class _Tile(NamedTuple):
-    """The header of one file."""
+    """The header of one of the asset's files."""
 
     path: str | os.PathLike[str]
     num_gaussians: int
@@ -171,8 +175,8 @@ class _Tile(NamedTuple):
 
 
 def _antialiased(tiles: Sequence[_Tile]) -> bool | None:
-    """Whether the gaussians of all files were trained with antialiasing; None if that
-    is not known, or not the same for all."""
+    """Return whether the gaussians of all files were trained with antialiasing; None if
+    that is unknown or differs between files."""
     return common([tile.antialiased for tile in tiles])
 
 
@@ -196,11 +200,12 @@ class _Sizes(NamedTuple):
         required = reserved + overhead + largest.whole_bytes + PIECE * gaussian
         expected = f"at least {in_mib(required)}"
         if largest.whole_bytes:
-            expected += (
-                f" for {shown(largest.path)}, whose format can only be read whole "
-                "(or convert it to .ply)"
-            )
-        check("memory", memory >= required, f"{expected}, got {memory / (1 << 20):,.1f} MiB")
+            expected += f" for {shown(largest.path)}, which must be read whole, unlike a .ply file"
+        check(
+            "memory",
+            memory >= required,
+            f"{expected}, got {memory / (1 << 20):,.1f} MiB; allow more memory",
+        )
         memory -= reserved
         for_block = memory - overhead - largest.whole_bytes
         for_split = memory - _OVERHEAD_BYTES
@@ -212,7 +217,7 @@ class _Sizes(NamedTuple):
         )
 
     def blocks(self, tiles: Sequence[_Tile], bar: Bar) -> "_Blocks":
-        """Return the asset in blocks of this size."""
+        """Yield the asset in blocks of at most `in_block` gaussians."""
         degree = max(tile.sh_degree for tile in tiles)
         return _blocks(tiles, Codec(degree).empty(self.in_block), bar)
 
@@ -224,13 +229,14 @@ def _bytes_in_bucket(degree: int) -> int:
 
 
 def scratch_bytes(count: int, degree: int) -> int:
-    """Return an upper bound of the scratch files' size for `count` gaussians."""
+    """Return an upper bound of the size of the scratch files for `count` gaussians, in
+    bytes."""
     return count * (4 + max(gaussian_bytes(degree), 2 * 16))
 
 
 def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
-    """Yield the asset in blocks that fill the buffer, each with its first row. A block
-    is valid until the next one."""
+    """Yield the asset in blocks that fill the buffer, each with the index of its first
+    gaussian. The next block overwrites the buffer."""
     first = 0
     filled = 0
     for tile in tiles:
@@ -378,8 +384,8 @@ def _ends_in_buckets(
     block: int,
     asset_gaussians: int,
 ) -> npt.NDArray[np.int64]:
-    """Return (B, blocks + 1) positions in the order: the start of each bucket, then its
-    end in each block."""
+    """Return (B, blocks + 1) positions in `order` for B buckets: where the bucket
+    starts, then where its gaussians from each block end."""
     counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
     for bucket, (begin, end) in enumerate(
         zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)

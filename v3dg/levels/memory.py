@@ -14,10 +14,10 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.whole import UNIT_LEAVES
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-# Memory per leaf of a unit until the levels are written: a number of bytes that does
-# not depend on the SH degree, and copies of the gaussian. A unit of 1,048,576 leaves
-# took 380 bytes per leaf at SH degree 0, where a gaussian has 56 bytes, and 870 at
-# degree 3, where it has 236.
+# Host memory for each leaf of a unit until the levels are written: a constant number of
+# bytes, plus this many copies of the gaussian. A unit of 1,048,576 leaves took 380
+# bytes per leaf at SH degree 0, where a gaussian has 56 bytes, and 870 bytes at degree
+# 3, where a gaussian has 236.
 _LEAF_BYTES = 320
 _LEAF_COPIES = 2.5
 
@@ -35,7 +35,9 @@ def in_bytes(memory: int | str | None) -> int:
         text = str(memory)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
     if match is None or not float(match[1]) > 0:
-        refuse("memory", f"bytes, or text like '8GiB', got {value_text(memory)}")
+        refuse(
+            "memory", f"a positive number of bytes, or text like '8GiB', got {value_text(memory)}"
+        )
     return int(min(float(match[1]) * _UNITS[match[2].upper()], 2.0**62))
 
 
@@ -50,7 +52,7 @@ def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
 
 
 def most_units(memory: int, leaves: Leaves) -> int:
-    """Return how many units may be in memory besides the leaves; at least one."""
+    """Return how many units may be in memory together with the leaves; at least one."""
     return max(
         1, (memory - leaves.resident_bytes) // unit_bytes(leaves.num_gaussians, leaves.sh_degree)
     )
@@ -70,12 +72,12 @@ def in_mib(num_bytes: int) -> str:
 
 def free_bytes() -> int:
     """Return the free memory in bytes: of the system, or of the container of the
-    process if that has less."""
+    process if the container has less."""
     free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with suppress(OSError, ValueError, AttributeError, TypeError):
         text = Path("/proc/meminfo").read_text(encoding="ascii")
         free = int(re.search(r"MemAvailable:\s*(\d+)", text)[1]) << 10  # type: ignore[index]
-    with suppress(OSError, ValueError):  # "max" is not a number
+    with suppress(OSError, ValueError):  # no cgroup, or the limit is "max"
         group = Path("/sys/fs/cgroup")
         limit = int((group / "memory.max").read_text())
         used = int((group / "memory.current").read_text())

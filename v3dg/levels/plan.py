@@ -1,5 +1,6 @@
-"""The shape of every level. It follows from counts alone, so the members of each group
-are known before anything is built."""
+"""The plan of a build: the clusters and groups of every level, and the numbers of their
+gaussians. They follow from the size of the asset and the config, so they are known
+before anything is built."""
 
 import itertools
 import math
@@ -18,17 +19,19 @@ Offsets = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class LevelPlan:
-    """One level, or a run of its groups: C clusters made by G groups, the same number
-    by each group.
+    """One level, or neighbouring groups of it: G groups, each of which is simplified to
+    the same number of clusters; C clusters in total.
 
     At level 0 every cluster counts as a group.
     """
 
-    first_group: int  # index in the level of the whole asset
+    first_group: int  # index of the first group, in the level of the whole asset
     offset: Offsets  # (C + 1,) boundaries of the clusters' gaussians
-    group_offset: Offsets  # (G + 1,) boundaries of the gaussians that groups are simplified to
-    leaf_offset: Offsets  # (G + 1,) boundaries of the gaussians of level 0 under the groups
-    weight: npt.NDArray[np.float32]  # (G,) weight of the footprint
+    # (G + 1,) boundaries of the gaussians that each group is simplified to.
+    group_offset: Offsets
+    leaf_offset: Offsets  # (G + 1,) boundaries of the leaves under each group
+    # (G,) the metric of a group is its footprint times this weight.
+    weight: npt.NDArray[np.float32]
 
     @property
     def num_clusters(self) -> int:
@@ -43,7 +46,8 @@ class LevelPlan:
         return int(self.offset[-1])
 
     def groups(self, first: int, last: int) -> "LevelPlan":
-        """Return a run of the groups, with their gaussians counted from 0."""
+        """Return the plan of some neighbouring groups, with gaussians counted from
+        0."""
         clusters_made = self.num_clusters // self.num_groups
         offset = self.offset[first * clusters_made : last * clusters_made + 1]
         group_offset = self.group_offset[first : last + 1]
@@ -59,10 +63,10 @@ class LevelPlan:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The levels of a whole asset, or of a subtree of it.
+    """A plan: the levels of a whole asset, or of a subtree of it.
 
-    All counts of clusters and groups are powers of two, so groups nest evenly: below a
-    run of groups, every level has a run of whole groups.
+    All numbers of clusters and groups are powers of two, so groups nest evenly:
+    neighbouring groups contain a whole number of groups of every lower level.
     """
 
     levels: tuple[LevelPlan, ...]
@@ -85,7 +89,8 @@ class Plan:
         return Plan(tuple(levels))
 
     def subtree(self, level: int, first_group: int, last_group: int) -> "Plan":
-        """Return the levels below a run of groups of one level, and that level."""
+        """Return the plan of neighbouring groups of one level and of everything below
+        them."""
         levels = []
         for lower in self.levels[: level + 1]:
             ratio = lower.num_groups // self.levels[level].num_groups
@@ -113,9 +118,9 @@ class Plan:
 
     @property
     def first_page(self) -> list[int]:
-        """The first page of each level, then the number of pages.
+        """The index of the first page of each level, followed by the number of pages.
 
-        The page of a group has the clusters that the group replaces.
+        The page of a group contains the clusters that the group replaces.
         """
         return list(itertools.accumulate(self._num_pages, initial=0))
 
@@ -161,10 +166,10 @@ def _level_above(lower: LevelPlan, num_groups: int, clusters_made: int) -> Level
 
 
 def halved(sizes: npt.NDArray[np.int64], depth: int) -> Offsets:
-    """Return the first element of each part, and the end, after splitting nodes in two
-    `depth` times.
+    """Return the offsets of the parts that result from splitting nodes of these sizes
+    in two, `depth` times.
 
-    The halves have the sizes of the median split.
+    The halves have the same sizes as in `_core.median_split`.
     """
     for _ in range(depth):
         sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()

@@ -1,4 +1,4 @@
-"""The bar of a build."""
+"""The progress bar of a build."""
 
 import threading
 
@@ -21,7 +21,8 @@ class Bar(_progress.Bar):
         super().__init__(total, "build", progress, initial=initial)
         self._last_level = len(plan.levels) - 1
         self._initial = initial
-        self._fitted: dict[tuple[int, int], float] = {}  # by part and first level
+        # Fitted gaussians, by part and lowest level.
+        self._fitted: dict[tuple[int, int], float] = {}
         self._lock = threading.Lock()
         self._is_stopped = False
 

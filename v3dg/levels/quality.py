@@ -14,15 +14,16 @@ from v3dg.levels.refined import DROP, record_of, refined_bundle
 
 Quality = Literal["draft", "standard", "best"]
 
-# Pictures of a standard refinement: some for every asset, and more for large ones,
-# whose gaussians are in fewer of them.
+# Number of pictures of a "standard" refinement: at least the first number, plus one for
+# every 50 gaussians, up to the last number. A large asset needs more because each
+# picture shows a smaller part of it.
 _LEAST_PICTURES = 20_000
 _GAUSSIANS_PER_PICTURE = 50
 _MOST_PICTURES = 100_000
-# The factor of a best one.
+# "best" uses this many times the pictures of "standard".
 _BEST = 5
-# Copies of the gaussians of all levels, twice as many as the asset has, that a
-# refinement needs.
+# A refinement needs memory for this many copies of all levels. All levels together have
+# about twice as many gaussians as the asset.
 _COPIES = 6
 
 
@@ -34,20 +35,21 @@ class Refinement:
     seed: int
 
     def refined(self, bundle: Bundle, device: Device, progress: Progress) -> Bundle:
-        """The bundle with refined levels; level 0 stays."""
+        """Return the bundle with refined levels; level 0 is unchanged."""
         return refined_bundle(
             bundle, steps=self.steps, seed=self.seed, device=device, progress=progress
         )
 
     def settings_of(self, bundle: Bundle, settings: JsonObject) -> JsonObject:
-        """The config of a bundle that was built with these settings and refined."""
+        """Return the config of a bundle that was built with these settings and then
+        refined."""
         if bundle.num_levels < 2:
             return settings
         return {**settings, "refined": record_of(self.steps, DROP, self.seed)}
 
 
 def refinement_of(quality: Quality, num_gaussians: int, seed: int) -> Refinement | None:
-    """The refinement of an asset of this many gaussians; None for a draft."""
+    """Return the refinement for an asset of this many gaussians; None for a draft."""
     one_of(quality, "quality", get_args(Quality))
     if quality == "draft":
         return None
@@ -58,7 +60,7 @@ def refinement_of(quality: Quality, num_gaussians: int, seed: int) -> Refinement
 
 
 def refine_bytes(quality: Quality, num_gaussians: int, sh_degree: int) -> int:
-    """Memory of the host that the refinement of an asset needs, in bytes."""
+    """Return the host memory, in bytes, that the refinement of an asset needs."""
     if quality == "draft":
         return 0
     return 2 * _COPIES * num_gaussians * gaussian_bytes(sh_degree)

@@ -1,5 +1,6 @@
-"""Levels that are refined together, in pictures of cuts, where gaussians hide each
-other."""
+"""Refines the levels of a bundle together, by comparing pictures of cuts with pictures
+of the asset. In a cut, gaussians of different groups hide each other; fits of single
+groups do not show that."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +19,21 @@ from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
+from v3dg.levels.rows import RUN_ROWS, in_runs
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
-# The factor of the step sizes of a fit. It is small because refinement starts from a
-# fitted level.
+# Step sizes of a refinement as a fraction of those of a fit. It is small because
+# refinement starts from fitted levels.
 _RATE = 0.2
-# The share of the visibility of a level that is dropped, unless the caller has another.
+# Default share of the visibility of a level that may be dropped, together with the
+# least visible gaussians.
 DROP = 0.02
-# The number of pictures that measure how much is seen of each gaussian.
+# Number of pictures that measure how visible each gaussian is.
 _NUM_WEIGHING_PICTURES = 2_000
-# A gaussian is measured if it is in the cuts of at least this many of them. Pictures
-# show only parts of a very large asset, so some gaussians are in too few.
+# The visibility of a gaussian counts as known if at least this many of the pictures
+# have it in their cuts. Each picture shows only a part of a very large asset, so some
+# gaussians are in fewer cuts.
 _LEAST_LOOKS = 8
 
 
@@ -43,19 +47,21 @@ def refined_bundle(
     device: Device,
     progress: Progress,
 ) -> Bundle:
-    """A copy of a bundle with refined levels, as `v3dg.refine_bundle`."""
+    """Return a copy of a bundle with refined levels; see `v3dg.refine_bundle`."""
     if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
     if drop > 0:
         bundle = without_unseen(bundle, cameras, drop, seed, device, progress)
     cuts = Cuts(bundle, cameras, seed, device, progress)
-    refined = cuts.refined(steps, default_steps(device))
-    config = {**bundle.config, "refined": record_of(steps, drop, seed, len(cameras))}
+    moved = cuts.refined(steps, default_steps(device))
+    refined = in_runs(moved, bundle.clusters.offset)
+    record = record_of(steps, drop, seed, len(cameras))
+    config = {**bundle.config, "refined": record, "run_rows": RUN_ROWS}
     return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
 
 
 def record_of(steps: int, drop: float, seed: int, num_cameras: int = 0) -> JsonObject:
-    """What the config of a bundle says of its refinement."""
+    """Return the entry about a refinement in the config of a bundle."""
     record: JsonObject = {"steps": steps, "drop": drop, "seed": seed}
     if num_cameras > 0:
         record["cameras"] = num_cameras
@@ -70,8 +76,12 @@ def without_unseen(
     device: Device,
     progress: Progress,
 ) -> Bundle:
-    """Drop from each level but the first what pictures of cuts show least of, up to
-    this share of what they show of the level."""
+    """Return the bundle without the least visible gaussians of each level above level
+    0.
+
+    `drop` is the share of a level's visibility, as measured in pictures of cuts, that
+    may be lost.
+    """
     cuts = Cuts(bundle, cameras, seed, device, progress)
     weights, looks = cuts.weights(_NUM_WEIGHING_PICTURES)
     return _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, weights), drop)
@@ -82,10 +92,13 @@ class RefineSteps:
     """How a refinement compares cuts with the asset, and how it moves gaussians.
 
     Attributes:
-        windows: Windows of pictures, 1 to 32, whose gradients make one step.
-        cuts_per_view: Cuts that are compared with each picture of the asset, 1 to 128.
-        rate: Step sizes of a gaussian that one of the windows shows, as parts of those
-            of a fit; they grow with the root of the number of windows that show it.
+        windows: Number of windows (rectangular parts of pictures) whose gradients make
+            one step, 1 to 32.
+        cuts_per_view: Number of cuts that are compared with each picture of the asset,
+            1 to 128.
+        rate: Step sizes, as fractions of those of a fit, of a gaussian that appears in
+            one of the windows. They grow with the square root of the number of windows
+            that show the gaussian.
     """
 
     windows: int
@@ -94,8 +107,8 @@ class RefineSteps:
 
 
 def default_steps(device: Device) -> RefineSteps:
-    """The steps for a kind of device: a GPU is busy only with several windows at once,
-    a CPU with one."""
+    """Return the default steps for a kind of device: a GPU is busy only with several
+    windows at once, a CPU with one."""
     if device.is_cuda:
         return RefineSteps(windows=16, cuts_per_view=4)
     return RefineSteps(windows=1)
@@ -114,8 +127,8 @@ class _CutOperation(Protocol[_T]):
 
 
 class Cuts:
-    """Pictures of a bundle's cuts, and copies of its gaussians on a device, which they
-    move."""
+    """Draws pictures of a bundle's cuts, and refines copies of its gaussians on a
+    device."""
 
     def __init__(
         self,
@@ -140,7 +153,8 @@ class Cuts:
         )
 
     def refined(self, num_pictures: int, settings: RefineSteps) -> Gaussians:
-        """Move the gaussians by this number of pictures, rounded up to whole steps."""
+        """Refine the gaussians with this number of pictures, rounded up to whole steps,
+        and return them."""
         clusters = self._bundle.clusters
         ball = self._bundle.groups.ball
         radius = np.where(clusters.own_group < 0, np.float32(1), ball[clusters.own_group, 3])
@@ -163,7 +177,8 @@ class Cuts:
         return self._gaussians.numpy()
 
     def weights(self, num_pictures: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
-        """What pictures show of each gaussian, and how many of their cuts have it."""
+        """Return how visible each gaussian is in some pictures, and how many of the
+        pictures have it in their cuts."""
         weigh = partial(_core.weigh_cuts, config=self._config(num_pictures, _RATE))
         return self._run("weigh", num_pictures, weigh)
 
@@ -192,10 +207,10 @@ class Cuts:
 
 
 def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
-    """Drop from each level but the first its gaussians of least weight, up to a share
-    of the level's weight.
+    """Drop the gaussians of least weight from each level above level 0, up to a share
+    of the level's total weight.
 
-    Gaussians whose weight is not a number stay, and count for nothing in the sum.
+    Gaussians whose weight is NaN stay, and are not counted in the total.
     """
     offset = bundle.clusters.offset
     is_kept = np.ones(bundle.num_gaussians, bool)

@@ -23,15 +23,15 @@ T = TypeVar("T")
 # graphs of other clients.
 _MOST_SILENCE_S = 120.0
 _TICK_S = 5.0  # time between two requests
-_ADVICE = "check it; finished units are kept, and a resumed build continues from them"
+_ADVICE = "check that it runs; finished units are kept, and a resumed build continues from them"
 
 
 class SchedulerError(RuntimeError):
-    """Raised if a scheduler does not answer, or has dropped its units."""
+    """Raised if a scheduler does not answer, or has dropped the units of the build."""
 
 
 class Watch:
-    """Sends requests to the scheduler of a client that waits for results.
+    """Detects a scheduler that no longer answers, while its client waits for results.
 
     Attributes:
         name: The scheduler's name in error messages.
@@ -48,11 +48,11 @@ class Watch:
         self._silent_s = 0.0
 
     def tick(self) -> None:
-        """Note that a tick has passed; raise SchedulerError after too many without an
-        answer.
+        """Record that `_TICK_S` seconds have passed; raise SchedulerError if the
+        scheduler has been silent for more than `_MOST_SILENCE_S`.
 
-        It counts ticks and does not read a clock, because a process that was itself
-        stopped for a while has received nothing in that time.
+        Ticks are counted, and no clock is read, so that times in which this process
+        itself was stopped do not count.
         """
         self._silent_s += _TICK_S
         if self._question is not None and self._question.done():

@@ -45,7 +45,7 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
         with _files.naming_errors(self.path):
             if not _files.read_at(self._descriptor, rows, first * self._row_bytes):
                 expected = f"expected rows {first} to {last} of a scratch file"
-                raise OSError(f"{self.path}: {expected}, got fewer")
+                raise OSError(f"{self.path}: {expected}, got fewer; build again")
         return rows
 
     def blocks(self, first: int, last: int, size: int) -> Iterator[npt.NDArray[_Scalar]]:
@@ -77,11 +77,11 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
         foreign_names = sorted(set(present) - own_names)
         if foreign_names:
             raise ValueError(
-                f"{folder}: expected scratch files of a build, got {foreign_names[0]!a}; move it "
-                "elsewhere"
+                f"{folder}: expected scratch files of a build, got another file, "
+                f"{foreign_names[0]!a}; move it elsewhere"
             )
-        # The mark is written before all other files and removed after them: without it
-        # none of them was created here.
+        # The mark is the first file to be created and the last to be removed: in a
+        # folder without a mark, no file is from a build.
         os.close(
             os.open(folder / _MARK, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         )

@@ -13,6 +13,7 @@ from v3dg.gaussians import Array, Gaussians, empty, put
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.plan import LevelPlan, Offsets, Plan
+from v3dg.levels.rows import in_runs
 
 # Number of groups that are initialised together. Ctrl-C has to wait for them, about a
 # second.
@@ -24,14 +25,16 @@ Show = Callable[[range, int, int, _core.FitProgress], None]
 
 @dataclass(frozen=True, eq=False)
 class LevelTables:
-    """The measured values of a level, on the host; all other values follow from the
-    plan."""
+    """The measured values of a level, on the host. All other values in the tables of a
+    bundle follow from the plan."""
 
     box: npt.NDArray[np.float32]  # (C, 2, 3), boxes around the drawn clusters
-    ball: npt.NDArray[np.float32]  # (G, 4), nested, for selection
-    # (G, 4), as small as possible, framed by the views of the fit
+    # (G, 4) balls for selection, each of which contains those below it.
+    ball: npt.NDArray[np.float32]
+    # (G, 4) smallest balls around groups, which the views of the fit show
     fit_ball: npt.NDArray[np.float32]
-    error: npt.NDArray[np.float32]  # (G, 2), residual of the fits
+    # (G, 2) remaining errors of the fits: colour and alpha.
+    error: npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +66,10 @@ class LevelBuilder:
         finished: Iterable[Level] = (),
         show: Show = lambda levels, num_groups, num_gaussians, state: None,
     ) -> Iterator[Level]:
-        """Yield all levels in ascending order, beginning with the leaves as level 0;
-        some may be `finished`."""
+        """Yield all levels in ascending order, beginning with the leaves as level 0.
+        `finished` are levels from level 1 on that need not be built again."""
         plan = self.plan.levels[0]
-        leaves = self.codec.rounded(leaves, plan.offset)
+        leaves = in_runs(self.codec.rounded(leaves, plan.offset), plan.offset)
         ball = _device.to_host(_core.bound_spheres(_spheres(leaves), plan.leaf_offset))
         tables = LevelTables(
             box=_device.to_host(_core.bound_by_boxes(leaves.rows, plan.offset)),
@@ -82,8 +85,9 @@ class LevelBuilder:
     def levels_above(
         self, lower_levels: dict[int, Level], finished: Iterable[Level], show: Show
     ) -> Iterator[Level]:
-        """Yield the levels above `lower_levels`, by number; that dict keeps the levels
-        that later ones are fitted to."""
+        """Yield the levels above `lower_levels`, a dict of levels by number. Its
+        content changes: new levels are added, and those that no later level is fitted
+        to are removed."""
         saved = iter(finished)
         num_levels = len(self.plan.levels)
         last = max(lower_levels)
@@ -99,7 +103,7 @@ class LevelBuilder:
             first_needed = min(last, self.config.target_of(last + 1))
             for number in [number for number in lower_levels if number < first_needed]:
                 del lower_levels[number]
-            while levels:  # do not keep a level alive that was yielded
+            while levels:  # do not keep yielded levels alive
                 yield levels.pop(0)
 
     def _simplify(
@@ -126,7 +130,7 @@ class LevelBuilder:
                 fit_config(config, self.seed, numbers[0]),
                 _target(lower_levels, targets, config),
                 _ranges(target_offsets, target_sizes),
-                gaussians.rows,  # the fit overwrites them by its result
+                gaussians.rows,  # the fit overwrites these arrays with its result
                 _ranges([plan.group_offset for plan in plans], np.diff(first_row)),
                 np.concatenate(fit_balls),
                 np.concatenate([_streams(*level) for level in zip(numbers, plans, strict=True)]),
@@ -158,7 +162,7 @@ class LevelBuilder:
 
 
 def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
-    """Return (G,) seeds of random numbers: every group of the asset has its own."""
+    """Return (G,) seeds of random numbers, different for every group of the asset."""
     return (number << 40) + np.arange(
         plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64
     )
@@ -186,7 +190,7 @@ def _level(
             gaussians.means, plan.group_offset, clusters_made.bit_length() - 1
         )
         gaussians = gaussians.subset(order)
-    gaussians = codec.rounded(gaussians, plan.offset)
+    gaussians = in_runs(codec.rounded(gaussians, plan.offset), plan.offset)
     box = _device.to_host(_core.bound_by_boxes(gaussians.rows, plan.offset))
     return Level(gaussians, LevelTables(box=box, ball=ball, fit_ball=fit_ball, error=error))
 
@@ -194,8 +198,8 @@ def _level(
 def _view(
     target: Level, plan: Plan, number: int, config: BuildConfig
 ) -> tuple[Offsets, npt.NDArray[np.float32]]:
-    """Return the targets of a level's groups: (G + 1,) offsets of their gaussians, and
-    (G, 4) balls that the views show."""
+    """Return what the groups of a level are fitted to: (G + 1,) offsets of the target's
+    gaussians, and (G, 4) balls that the views show."""
     source = config.target_of(number)
     leaf_offset = plan.levels[number].leaf_offset
     if source == 0:
@@ -226,9 +230,8 @@ def _target(
     """Return the gaussians that groups are fitted to, with the appearance that they
     have when they are selected.
 
-    The filter of the asset is left out: it widens gaussians without reducing their
-    opacity, the more the smaller they are shown, so coarser levels would become too
-    thick.
+    The asset's own filter is left out. It widens gaussians without reducing their
+    opacity, most of all at small sizes, so coarser levels would become too thick.
     """
     rows = _joined([lower_levels[number].gaussians for number in numbers]).rows
     if numbers[0] == 0:
@@ -239,8 +242,8 @@ def _target(
 def _start(
     gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig
 ) -> Gaussians:
-    """Return the initial gaussians of groups: their gaussians from `offset`, reduced to
-    the numbers of `out_offset`."""
+    """Return the initial gaussians of groups: those at `offset`, reduced to as many as
+    `out_offset` has room for."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
     result = empty(int(out_offset[-1]), gaussians.sh_degree)
@@ -265,8 +268,8 @@ def _halved(
 
 
 def _ranges(offsets: Sequence[Offsets], counts: Sequence[int] | Offsets) -> npt.NDArray[np.int64]:
-    """Return (S, 2) first element and end of each segment of arrays of `counts`
-    elements that are concatenated."""
+    """Return (S, 2) start and end of S segments in concatenated arrays. `offsets` has
+    the boundaries of the segments in each array, and `counts` the arrays' lengths."""
     first = np.cumsum([0, *counts])
     moved = [offset + start for offset, start in zip(offsets, first[:-1], strict=True)]
     return np.concatenate([np.stack([offset[:-1], offset[1:]], axis=1) for offset in moved])

@@ -12,10 +12,12 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.plan import Plan
 from v3dg.levels.simplify import LevelBuilder
 
-# Number of groups of level 1 that are fitted with this filter and without a filter.
+# Number of groups of level 1 that are fitted twice: with a filter of this variance, and
+# without a filter.
 _GROUPS = 32
 _FILTER_PX2 = 0.05
-# Largest number of leaves in such a group; larger groups would take too long.
+# Maximum number of leaves in one of these groups; fitting larger ones would take too
+# long.
 _MOST_LEAVES = 1 << 15
 # An asset needs the filter if its loss without the filter is larger by this factor
 # (docs/levels.md).
@@ -41,8 +43,8 @@ def measured_config(
     first_leaves = level_1.leaf_offset[stride // 2 : -1 : stride].tolist()
     parts = [_device.place(leaves.read(first, first + size), device) for first in first_leaves]
     sample = Gaussians.concatenate(parts)
-    # The sample consists of the groups that were read. Each has two clusters, whatever
-    # the group size of the build is.
+    # The sample consists of the groups that were read. Each is divided into two
+    # clusters, for any group size of the build.
     sample_config = replace(
         config,
         init="merge",

@@ -34,7 +34,8 @@ from v3dg.levels.plan import LevelPlan
 from v3dg.levels.scratch import lock
 from v3dg.levels.simplify import Level, LevelTables
 
-# Each level begins with its part, its number, and the hash of the arrays that follow.
+# A record begins with the number of its part, the number of its level, and the hash of
+# the arrays that follow.
 _RECORD = struct.Struct("<II16s")
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
 
@@ -52,8 +53,8 @@ class FinishedLevel:
 
 
 Part = Mapping[int, tuple[LevelPlan, PageRun]]
-"""The work of one worker: the plan and the pages of each level, by the number of the
-level."""
+"""The levels of a unit, or of the part above all units: the plan and the pages of each
+level, by the level's number."""
 
 Refine = Callable[[Bundle], Bundle]
 """Returns a bundle with refined levels."""
@@ -81,25 +82,29 @@ class PageFile:
 
     @contextmanager
     def _opened(self, flags: int) -> Iterator[int]:
-        """Open the file again, so that this machine sees the writes of others and they
-        see its writes."""
+        """Open the file anew, so that on a network file system this machine and others
+        see each other's writes."""
         with _files.naming_errors(self.path):
             descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
                 head = os.pread(descriptor, len(self.head), 0)
-                check(self.path, head == self.head, "the unfinished bundle of this build")
+                check(
+                    self.path,
+                    head == self.head,
+                    "the unfinished bundle of this build, got another file; build again",
+                )
                 yield descriptor
             finally:
                 os.close(descriptor)
 
 
 class Unfinished:
-    """A bundle in progress. Its file replaces `bundle_path` at the end, or stays in
-    place if that is None.
+    """A bundle in progress. Its file replaces `bundle_path` at the end, or stays where
+    it is if `bundle_path` is None.
 
     A truncated record is ignored; a damaged record or page is an error. The file is
-    locked while a build uses it, and removed after a build that finished only the
-    leaves.
+    locked while a build uses it. It is removed if the build ends before a level above
+    the leaves is finished.
     """
 
     def __init__(
@@ -126,7 +131,7 @@ class Unfinished:
         check(
             "resume_path",
             self._path.parent.is_dir(),
-            f"a file in an existing folder, got {self._path}",
+            f"a file in an existing folder, got {self._path}; create the folder",
         )
         self._file = _open_locked(self._path)
         try:
@@ -177,7 +182,7 @@ class Unfinished:
             ) from error
 
     def _read_journal(self) -> None:
-        """Read the levels before a truncated record, and check their pages."""
+        """Read all complete records, and check the pages of their levels."""
         descriptor = self._file.fileno()
         head = np.empty(_RECORD.size, np.uint8)
         while _files.read_at(descriptor, head, self._end):
@@ -201,7 +206,7 @@ class Unfinished:
             if page_hash(arrays) != digest:
                 raise ValueError("a level is damaged")
             level = FinishedLevel(tables, hashes)
-            level.read(self.pages, run)  # this checks the hashes of its pages
+            level.read(self.pages, run)  # checks the hashes of the pages
             self.levels[part, number] = level
             self._end = end
 
@@ -230,7 +235,7 @@ class Unfinished:
             try:
                 self._plan.write_header(descriptor)
             except OSError:
-                # Needs no disk space, because it overwrites bytes.
+                # This works on a full disk, because it overwrites existing bytes.
                 os.pwrite(descriptor, self.pages.head, 0)
                 raise
             self.is_whole = True
@@ -239,9 +244,10 @@ class Unfinished:
     def bundle(self, refine: Refine | None = None) -> Bundle:
         """Return the complete bundle, moved to its final path.
 
-        A refined one is written there; until then this file has the levels as they are
-        built, and a build that is killed refines them again. Without a final path this
-        file stays, and the refined bundle is in memory.
+        With `refine`, the refined bundle is written to the final path instead. Until
+        then, this file keeps the unrefined levels, so a build that is killed only has
+        to refine again. Without a final path, this file stays and the refined bundle is
+        in memory.
         """
         if refine is not None:
             refined = refine(Bundle.open(self._path))
@@ -291,8 +297,8 @@ class MemoryStore:
 
 
 def described(device: Device) -> tuple[str, str]:
-    """Return the kind of a device and the version of v3dg, on which the last bits of a
-    build depend."""
+    """Return the description of a device and the version of v3dg; the last bits of a
+    build depend on both."""
     return _device.describe(device), __version__
 
 
@@ -331,14 +337,22 @@ def _open_locked(path: str | os.PathLike[str]) -> FileIO:
     # it.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
     while True:
-        check(path, not os.path.islink(path), "a file of levels, got a link; remove it")
-        # The file has the permissions of the bundle that it will replace.
+        check(
+            path, not os.path.islink(path), "an ordinary file, got a symbolic link; remove the link"
+        )
+        # Other users cannot read the unfinished file. The finished file gets the
+        # permissions of the bundle that it replaces.
         file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o600))
         try:
             status = os.fstat(file.fileno())
-            check(path, stat.S_ISREG(status.st_mode), "a file of levels, got a device or a pipe")
+            check(
+                path,
+                stat.S_ISREG(status.st_mode),
+                "an ordinary file, got a device or a pipe; choose another path",
+            )
             lock(file.fileno(), path)
-            # The previous owner of the lock may have removed the file.
+            # The process that held the lock before may have removed the file; then open
+            # it again.
             with suppress(FileNotFoundError):
                 if os.path.samestat(status, os.lstat(path)):
                     return file

@@ -1,5 +1,5 @@
-"""The build of a whole asset: an executor builds its units, then the levels above them
-are built here."""
+"""Builds a whole asset: threads or an executor build its units, then this process
+builds the levels above them."""
 
 import os
 import socket
@@ -35,14 +35,14 @@ from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 
-# The number of leaves in a unit. It keeps a GPU busy and needs little memory. The last
-# bits of a bundle depend on it.
+# Number of leaves in a unit: enough to keep a GPU busy, at little memory. The last bits
+# of a bundle depend on it.
 UNIT_LEAVES = 1 << 20
-# The factor by which the balls of level 1 grow if a smooth asset is too large to be
+# Factor by which the balls of level 1 grow if a smooth asset is too large to be
 # measured. Level 1 is then selected at half the size (docs/levels.md).
 _UNMEASURED = 2.0
-# The number of units that a GPU processes at once, so that it is not idle during the
-# smallest levels of one.
+# Number of units that a GPU processes at once, so that it is not idle while one of them
+# is at its smallest levels.
 _UNITS_ON_GPU = 4
 
 _Levels = dict[int, FinishedLevel]
@@ -110,14 +110,15 @@ def _opened(
     device: Device,
     bundle_path: Path | None,
 ) -> AbstractContextManager[Unfinished | MemoryStore]:
-    """The place of the levels of a build: a file, or memory."""
+    """Return the store for the levels of a build: a file, or memory."""
     if path is None:
         return nullcontext(MemoryStore(file))
     return Unfinished(Path(path), file, parts, device, bundle_path)
 
 
 def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
-    """Return the parts of the units and, last, the part above them."""
+    """Return the part of each unit and, last, the part of the levels above all
+    units."""
 
     def runs(number: int, count: int) -> list[PageRun]:
         first, last = plan.first_page[number : number + 2]
@@ -173,7 +174,7 @@ class _Build:
         if runs:
             first = self.config.target_of(self.num_low)
         lower_levels: dict[int, Level] = {}
-        # These are the targets and initial gaussians of the levels above.
+        # The levels above the units are fitted to these levels and start from them.
         for n in range(first, self.num_low):
             gaussians = _device.place(self._level(n).gaussians, devices[0])
             lower_levels[n] = Level(gaussians, finished[n].tables)
@@ -261,7 +262,10 @@ class _Build:
             if watch is not None:
                 name = watch.name
             reason = f"{type(error).__name__}: {error}".rstrip(": ")
-            raise RuntimeError(f"{name}: expected all units to be built, got {reason}") from error
+            raise RuntimeError(
+                f"{name}: building a unit failed ({reason}); finished units are kept, so build "
+                "again to continue"
+            ) from error
 
     def _collect(
         self, submit: Callable[[int], Future[_Levels]], watch: Watch | None = None
@@ -307,7 +311,7 @@ class _Build:
 
 @dataclass(frozen=True, eq=False)
 class UnitTask:
-    """Everything that the work on a unit needs. It can be pickled if `leaves` and
+    """Everything that the work on a unit needs. It can be pickled if its `leaves` and
     `pages` can."""
 
     leaves: Callable[[], Gaussians]
@@ -356,11 +360,14 @@ def build_in_worker(task: UnitTask, expected_device: WorkerDevice, _: bytes) -> 
     worker_device = WorkerDevice(expected_device.kind, *described(device))
     if worker_device != expected_device:
         raise RuntimeError(
-            f"{worker}: expected {expected_device} like the main process, "
-            f"got {worker_device}; results would differ in their last bits"
+            f"{worker}: expected {expected_device} like the main process, got {worker_device}; "
+            "results would differ in their last bits, so use workers of the same kind"
         )
     assert isinstance(task.pages, PageFile)
     if not task.pages.path.exists():
-        raise RuntimeError(f"{worker}: expected {task.pages.path}, got none; share its folder")
+        raise RuntimeError(
+            f"{worker}: {task.pages.path} does not exist there; put resume_path on a disk that "
+            "all workers share"
+        )
     with _device.own_stream(device), _device.memory_errors():
         return dict(task.levels(device, lambda *_: None))

@@ -74,9 +74,9 @@ def render(
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
     Level 0 is drawn with the asset's own filter, coarser levels with the filter that
     they were made for (V3DG, section 3.4; docs/levels.md defines the metric). An asset
-    is drawn completely and without a filter. One that was trained with antialiasing
-    (`Gaussians.antialiased`) is drawn as it was trained, with 0.3 px² and compensated
-    opacities.
+    is drawn completely and without a filter. An asset that was trained with
+    antialiasing (`Gaussians.antialiased`) is drawn as in training: with a filter of 0.3
+    px² and compensated opacities.
 
     Args:
         subject: What to draw, in world space; or its file, which every call opens
@@ -86,26 +86,26 @@ def render(
             and one frame. Their two pictures have common statistics, which are sums,
             except for the number of selected gaussians. None means the first camera of a scene's
             file, else the camera of `first_camera`.
-        tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
-        fade: As in `v3dg.select`; weights multiply opacities. Use `v3dg.DEFAULT_FADE`
-            for a film.
+        tolerance, budget, min_level: As in `v3dg.select`.
+        fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
+            `v3dg.DEFAULT_FADE` for films.
         cut: A cut that was selected earlier from this scene, which is drawn for any
             camera, so that it can be inspected from all sides. Replaces `tolerance`,
             `budget`, `min_level` and `fade`.
         color_by: "level" or "cluster" colours gaussians by their level or cluster,
             "residency" shows where pages are missing.
-        background: Three numbers.
+        background: Three numbers: the colour behind all gaussians.
         min_transmittance: A pixel stops behind the gaussian that leaves this
             transmittance or less, 0 to 0.99, and distributes the rest over the
             gaussians that it has blended. So the error of a channel is at most this
-            fraction of the difference to what lies behind. None means 0.001 for scenes
-            and bundles; assets are then drawn as by `v3dg.rasterize`.
-        depth: Draw the expected depth, too.
+            fraction of the difference to the colour behind that gaussian. None means
+            0.001 for scenes and bundles; assets are then drawn as by `v3dg.rasterize`.
+        depth: Whether to draw the expected depth, too.
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what
             the next picture of the same scene or bundle needs; a `Renderer` controls
             how long. "auto" means "cuda" if it works.
-        memory: As in `Renderer`; each picture is settled.
+        memory: As in `Renderer`; each picture waits for all pages that it needs.
 
     Raises:
         ValueError: An argument is invalid, or the coarsest cut has more gaussians than
@@ -141,20 +141,21 @@ def first_camera(
     *,
     up: Axis | VectorLike | None = None,
 ) -> Camera:
-    """Return the camera that first shows a subject, the same as in the viewer and of
-    `v3dg render`: all of an object, from its front and a little above; the middle of a
-    room, from inside.
+    """Return the default camera for a subject, which the viewer and `v3dg render` also
+    use. It shows all of an object, from its front and a little above. A room is shown
+    from its middle.
 
-    The field of view is 45 degrees across the shorter side, 65 degrees inside.
+    The field of view across the shorter side is 45 degrees, and 65 degrees inside a
+    room.
 
     Args:
-        subject: A scene, a bundle or an asset, or the file of it.
+        subject: A scene, a bundle, an asset, or the path of a file with one of them.
         width, height: Size of the picture in px.
         up: The axis or direction that is up; None uses the axis of
             `v3dg.upright.up_of`.
 
     Raises:
-        ValueError: An argument is not as above.
+        ValueError: An argument is invalid.
     """
     width = whole(width, "width", "a positive whole number", 1)
     height = whole(height, "height", "a positive whole number", 1)
@@ -165,13 +166,13 @@ def first_camera(
         one_of(up, "up", AXES)
         up = direction_of(up)
     direction = vector(up, "up")
-    check("up", direction.any(), "a direction, got (0, 0, 0)")
+    check("up", direction.any(), "a direction other than zero, got (0, 0, 0)")
     return frame_subject(content).camera(direction, width, height)
 
 
 def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
-    """Return a subject and the camera that it is drawn with by default: the first one
-    of its file, else a first view of it."""
+    """Return a subject and its default camera: the first camera in its file, else that
+    of `first_camera`."""
     if not isinstance(subject, str | os.PathLike):
         return subject, first_camera(subject)
     path = Path(subject)
@@ -184,11 +185,11 @@ def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
 def _still_frame(
     subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
 ) -> FrameSource:
-    """Return the frame for single pictures of a subject, which is stored with a scene
-    or a bundle.
+    """Return the frame for single pictures of a subject. The frame of a scene or of a
+    bundle is stored with it.
 
-    All colours share a pool. If the size of the pool is given, only the last pool is
-    kept.
+    Frames that differ only in `color_by` share a pool. If the size of the pool is
+    given, only the last pool is kept.
     """
     if isinstance(subject, Gaussians):
         return frame_of(subject, color_by, device, memory, PoolSlot())

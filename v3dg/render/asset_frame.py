@@ -1,5 +1,4 @@
-"""The frame of an asset, which is drawn completely: it has no levels to choose from,
-and no pages."""
+"""The frame of an asset. An asset has no levels and no pages, so all of it is drawn."""
 
 from __future__ import annotations
 
@@ -57,7 +56,7 @@ class AssetFrame:
     ) -> Picture:
         """Draw the asset; raise ValueError if the request needs levels."""
         is_selected = request.selection is None
-        check("cut", is_selected, "a scene or a bundle to choose from, got an asset")
+        check("cut", is_selected, "no cut for an asset, which has no levels, got one; leave it out")
         check_request(request.cut)
         camera = request.camera
         if isinstance(camera, StereoCamera):
@@ -96,7 +95,7 @@ def check_request(request: CutRequest) -> None:
 
 def _check(tolerance: float | None, budget: int | None, min_level: int, fade: float | None) -> None:
     for name, value in (("budget", budget), ("min_level", min_level)):
-        check(name, not value, "a scene or a bundle to choose from, got an asset")
+        check(name, not value, "no value for an asset, which has no levels, got one; leave it out")
     CutRequest(tolerance=tolerance, fade=fade).rule  # noqa: B018 - which checks them
 
 

@@ -61,7 +61,7 @@ class FrameSource(Protocol):
 
     @property
     def memory(self) -> int | None:
-        """Bytes of the pool that it draws from; None if everything is resident."""
+        """Size of the frame's pool in bytes; None if everything is resident."""
 
     def chosen(self, subject: Subject) -> Frame:
         """Return the frame that currently draws the subject."""
@@ -122,7 +122,7 @@ def frame_of(
 
     Args:
         memory: Bytes of a pool; "auto" and None as in `v3dg.Renderer`.
-        slot: Where its pool is stored, if it gets one.
+        slot: Where the frame stores its pool, if it has one.
 
     Raises:
         ValueError: `color_by` or `memory` is invalid; see `v3dg.Renderer`.

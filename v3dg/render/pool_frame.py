@@ -1,5 +1,5 @@
-"""The frame of a pool: only those of a scene's gaussians are resident that views need
-and that fit."""
+"""The frame of a pool. Only those gaussians of a scene are resident that views need and
+that fit into the pool."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class PoolFrame:
     It does not keep the subject alive.
 
     Attributes:
-        device: Where it draws.
-        memory: Bytes of the pool.
+        device: The device that draws.
+        memory: Size of the pool in bytes.
     """
 
     def __init__(self, color_by: ColorBy, device: Device, memory: int, slot: PoolSlot) -> None:
@@ -49,7 +49,7 @@ class PoolFrame:
         self._pool: Pool | None = None
         self._references: tuple[weakref.ref[Bundle], ...] | None = None
         self._resident: ResidentScene | None = None  # the scene as it was last drawn
-        self._has_settled = False  # whether nothing was drawn since `settle`
+        self._has_settled = False  # whether `settle` was called after the last picture
 
     @property
     def core(self) -> _core.PagePool:
@@ -65,7 +65,9 @@ class PoolFrame:
         with residency.lock:
             bundles = resident.bundles
             tables = [residency.table(bundle) for bundle in bundles]
-            pool = None  # both references must end, because the memory of the pool may be needed
+            # Drop both references, because the new pool may need the memory of the old
+            # one.
+            pool = None
             self._pool = None
             pool = self._slot.pool(bundles, tables, self.device, self._num_bytes)
             self._pool = pool
@@ -93,7 +95,8 @@ class PoolFrame:
         if not self.device.is_cuda:
             _finish(picture)
         elif self._has_settled:
-            # If this draws again, the pages of other views may have replaced its own.
+            # If buffers were too small, the picture is drawn again. Finishing it now
+            # ensures that the pages brought in by `settle` are still resident then.
             _finish(picture)
         self._has_settled = False
         return picture
@@ -125,8 +128,8 @@ class PoolFrame:
         timeout: float = _STILL_TIMEOUT_SECONDS,
         seconds: float = math.inf,
     ) -> None:
-        """Bring in the pages that a view needs, or those that arrive within `seconds`;
-        raises the errors of `Pool.settle`."""
+        """Bring in the pages that a view needs, or those of them that arrive within
+        `seconds`. The errors are those of `Pool.settle`."""
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = cut.rule
         with residency.turn(self.device):
@@ -137,7 +140,8 @@ class PoolFrame:
         self._has_settled = True
 
     def pick(self, subject: Subject, pixel: _core.Camera, rule: _core.Rule) -> _core.Pick | None:
-        """Return the gaussian with the largest weight in a pixel; only on the CPU."""
+        """Return the gaussian with the largest weight in a pixel. Supported only on the
+        CPU."""
         resident = residency.scene(subject, self.device)
         pool = self.take(resident)
         request = _core.FrameRequest(pixel, rule, look=_core.Look(aside=True))
@@ -190,5 +194,6 @@ def _finish(picture: Picture) -> None:
 def _refuse_given_cut(request: FrameRequest) -> None:
     if request.selection is not None:
         raise ValueError(
-            "cut: a renderer with a pool selects its own cut; leave it out, or give memory=None"
+            "cut: a renderer with a pool selects its own cut; leave it out, or create the renderer "
+            "with memory=None"
         )

@@ -44,9 +44,10 @@ class Renderer:
     pictures in progress are finished first.
 
     With a budget and a fade, pictures count as a sequence: the tolerance moves in steps
-    to the value at which a part of the budget is free, never below that of `render`, so
-    that slow motion is steady; at rest it arrives after eight pictures (docs/fades.md).
-    Without a fade, pictures are those of `render`.
+    to the value at which a part of the budget is free, never below that of
+    `v3dg.render`, so that slow motion is steady; with a camera at rest, it arrives
+    after eight pictures (docs/fades.md). Without a fade, pictures equal those of
+    `v3dg.render`.
 
     With a pool, only a part of the bundles is resident, so the bundles may be far
     larger than memory. Other threads read pages from the files as views need them. A
@@ -61,8 +62,8 @@ class Renderer:
             current device changes.
         memory: Size of a pool for gaussians on the device: bytes, or text like "2GB".
             None keeps all gaussians resident. "auto" means None if all of them fit into
-            the free memory, less a quarter of that or 1 GiB; otherwise it means half of
-            the free memory.
+            the free memory with a reserve, which is a quarter of the free memory but at
+            most 1 GiB; otherwise it means half of the free memory.
 
     Raises:
         RuntimeError: The device is not available.
@@ -86,7 +87,7 @@ class Renderer:
 
     @property
     def memory(self) -> int | None:
-        """Bytes of the pool that it draws from; None if everything is resident."""
+        """Size of the renderer's pool in bytes; None if everything is resident."""
         return self._frame.memory
 
     def __repr__(self) -> str:
@@ -97,12 +98,12 @@ class Renderer:
 
     @property
     def subject(self) -> Subject:
-        """The subject that it draws."""
+        """The subject of the pictures."""
         return self._subject
 
     @property
     def pool_frame(self) -> PoolFrame | None:
-        """The frame of its pool; None without a pool. Not part of the public
+        """The renderer's frame if it has a pool, else None. Not part of the public
         interface."""
         frame = self._frame.chosen(self._subject)
         if isinstance(frame, PoolFrame):
@@ -128,7 +129,8 @@ class Renderer:
         min_transmittance: float | None = None,
         depth: bool = False,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
-        """Draw as `v3dg.render` does, using what is resident."""
+        """Draw a picture with what is resident; the arguments are those of
+        `v3dg.render`."""
         check_camera(camera)
         subject = self._subject
         is_asset = isinstance(subject, Gaussians)
@@ -151,18 +153,19 @@ class Renderer:
         misses no page.
 
         The next picture is then the same, bit for bit, as if everything were resident.
-        If there is not enough room, it is the picture at the tolerance that it reports.
-        On a CUDA device, drawing it waits, too. Returns at once if everything is
-        resident. Threads that share a renderer may evict each other's
-        pages between the two calls; `v3dg.render` settles and draws in one step.
+        If the pool has too little room, the next picture has a larger tolerance, which
+        its statistics report. On a CUDA device, drawing the next picture waits until
+        the GPU has finished it. Returns at once if everything is resident. Threads that
+        share a renderer may evict each other's pages between `settle` and `render`;
+        `v3dg.render` settles and draws in one step.
 
         Args:
-            timeout: Seconds without an arriving page after which it raises
-                TimeoutError.
+            timeout: After this many seconds in which no page arrives, TimeoutError is
+                raised.
 
         Raises:
             ValueError: A page is damaged; the message says which.
-            OSError: A page cannot be read. TimeoutError if the disk does not answer.
+            OSError: A page cannot be read.
         """
         real(timeout, "timeout", "seconds, at least 0", 0)
         cut = CutRequest(tolerance, budget, min_level, fade)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from v3dg.false_color import ColorBy
     from v3dg.select import Selection
 
-# The default for pictures with levels, whose own error is far larger; docs/cuda.md
+# The default for scenes and bundles, whose levels have a far larger error; docs/cuda.md
 # states how much time it saves.
 DEFAULT_MIN_TRANSMITTANCE = 1e-3
 BLACK = (0.0, 0.0, 0.0)
@@ -31,8 +31,7 @@ _PLAIN_TYPES = frozenset({float, int, type(None)})
 
 
 class CutRequest(NamedTuple):
-    """The cut of a view, in terms of the API; the fields are arguments of
-    `v3dg.select`."""
+    """The arguments of `v3dg.select` that describe the cut of a view."""
 
     tolerance: float | None = None
     budget: int | None = None
@@ -41,13 +40,13 @@ class CutRequest(NamedTuple):
 
     @property
     def is_plain(self) -> bool:
-        """Whether all values are Python's own numbers, so that results can be cached by
-        them."""
+        """Whether all values are Python's own numbers. Only then can results be cached
+        with the values as keys."""
         return _PLAIN_TYPES.issuperset(map(type, self))
 
     @property
     def rule(self) -> _core.Rule:
-        """The rule for the core; ValueError if a number is not valid for
+        """Return the rule for the core; raise ValueError if a value is invalid for
         `v3dg.select`."""
         if self.is_plain:
             return _known_rule(*self)
@@ -61,14 +60,14 @@ def _rule(
 
 
 # Consecutive pictures mostly have equal requests. The cache distinguishes types,
-# because True, which is rejected, equals 1.
+# because True equals 1 but must be rejected.
 _known_rule = lru_cache(64, typed=True)(_rule)
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a picture of a pool shows instead of the frame's own colours, and the cut
-    that it shows; anything but "appearance" works only on the CPU.
+    """The colours that a picture drawn from a pool shows, and the choice of its cut.
+    Colours other than "appearance" work only on the CPU.
 
     Attributes:
         shows: Colours as in `v3dg.render`; "error" shows metrics as fractions of the
@@ -76,8 +75,8 @@ class Look:
             pixel blends.
         chooser: The camera that the cut is selected for; None for the camera of the
             picture.
-        aside: Draw the pages that were resident for the last picture, and neither bring
-            pages in nor request any.
+        aside: Whether to draw only the pages that were resident for the last picture,
+            without bringing pages in or requesting any.
     """
 
     shows: ColorBy | Literal["error", "count"] = "appearance"
@@ -86,13 +85,13 @@ class Look:
 
     @property
     def is_plain(self) -> bool:
-        """Whether it shows the gaussians themselves, with the cut for the camera of the
-        picture."""
+        """Whether the picture has the gaussians' own colours, a cut for its own camera,
+        and pages as usual."""
         return self.shows == "appearance" and self.chooser is None and not self.aside
 
     def core(self, bundles: Sequence[Bundle]) -> _core.Look | None:
         """Return the look for the compiled operations, for pictures of these bundles;
-        None if it shows the gaussians themselves."""
+        None for the default look."""
         if self.is_plain:
             return None
         chooser = None
@@ -149,7 +148,9 @@ def _shade(
     background: Sequence[float], min_transmittance: float | None, *, is_asset: bool, depth: bool
 ) -> _core.Shade:
     if min_transmittance is not None:
-        stop = real(min_transmittance, "min_transmittance", "a share of light, 0 to 0.99", 0, 0.99)
+        stop = real(
+            min_transmittance, "min_transmittance", "a transmittance from 0 to 0.99", 0, 0.99
+        )
     elif is_asset:
         stop = -1.0
     else:

@@ -146,16 +146,16 @@ class SceneFrame:
 def _check_cut(
     cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest
 ) -> None:
-    """Raise ValueError for a cut that is not of the current scene, and for other
-    arguments besides a cut."""
+    """Raise ValueError for a cut that was not selected from the current scene, and for
+    other arguments that contradict the cut."""
     check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in request._asdict().items():
-        check(name, not value, f"no value besides a cut, got {value}")
+        check(name, not value, f"no value together with a cut, got {value}; leave it out")
     is_from_bundle = isinstance(subject, Bundle) and cut.scene.bundles == (subject,)
     check(
         "cut",
         cut.scene is subject or is_from_bundle,
-        "a selection from this scene, got one from another",
+        "a selection from this scene, got one from another scene; select again",
     )
     if isinstance(subject, Scene):
         cut.check(resident.revision)

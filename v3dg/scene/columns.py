@@ -1,5 +1,5 @@
-"""The columns of a scene's instances: their shapes, ranges and devices, and poses given
-in other ways."""
+"""The columns of a scene's instances: checks of shapes, ranges and devices, and
+conversions of poses."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, cast
@@ -41,14 +41,14 @@ _ROW = {
     "opacity": (),
     "tint": (3,),
 }
-# Columns that are on the host, as float32, wherever the poses are.
+# Columns that are always on the host, as float32, even if poses are on a device.
 _ON_HOST = ("importance", "opacity", "tint")
 _DEFAULTS: dict[str, Array] = {"quaternions": (1.0, 0.0, 0.0, 0.0), "scales": 1.0}
 _RANGES = {
     "scales": (5e-324, np.inf, "positive numbers"),
     "importance": (LEAST_FLOAT, MOST_FLOAT, "positive numbers that a float32 can hold"),
-    "opacity": (0.0, 1.0, "numbers of 0 to 1"),
-    "tint": (0.0, MOST_FLOAT, "numbers of 0 or more that a float32 can hold"),
+    "opacity": (0.0, 1.0, "numbers from 0 to 1"),
+    "tint": (0.0, MOST_FLOAT, "numbers of at least 0 that a float32 can hold"),
 }
 
 
@@ -60,7 +60,7 @@ def columns_of(
     opacity: npt.ArrayLike,
     tint: npt.ArrayLike,
 ) -> Columns:
-    """Return the columns of as many instances as there are positions."""
+    """Return checked columns; the number of positions is the number of instances."""
     points = _points_of(positions)
     count = len(points)
     return Columns(
@@ -74,10 +74,12 @@ def columns_of(
 
 
 def composed(outer: Columns, inner: Columns) -> Columns:
-    """Return the columns of instances that one pose places as a whole."""
+    """Return the columns of instances after placing all of them together with one outer
+    pose."""
     size = outer.scales[0]
     rotation = rotation_from_quaternion(outer.quaternions[0])
-    with np.errstate(over="ignore", under="ignore"):  # columns_of() refuses the results
+    # Columns_of() rejects invalid results.
+    with np.errstate(over="ignore", under="ignore"):
         return columns_of(
             positions=size * inner.positions @ rotation.T + outer.positions,
             quaternions=product(outer.quaternions, inner.quaternions),
@@ -89,8 +91,8 @@ def composed(outer: Columns, inner: Columns) -> Columns:
 
 
 def _points_of(positions: Array | npt.ArrayLike | None) -> Array:
-    """Return (I, 3) positions; a single one may be given as (3,), and None stands for
-    the origin."""
+    """Return positions (I, 3). A single position may be passed as (3,); None means the
+    origin."""
     points: Array = positions
     if positions is None:
         points = (0.0, 0.0, 0.0)
@@ -104,18 +106,19 @@ def _points_of(positions: Array | npt.ArrayLike | None) -> Array:
 
 
 def parts_of(matrix: Array | npt.ArrayLike, *parts: Array | npt.ArrayLike | None) -> Similarity:
-    """Return the position, the quaternion and the scale of matrices; ValueError if
-    other parts are given, too."""
+    """Return the positions, quaternions and scales of matrices; raise ValueError if
+    these are also passed separately."""
     if any(part is not None for part in parts):
         raise ValueError(
-            "matrix: it already places the instances; leave out positions, quaternions and scales"
+            "matrix: cannot be combined with positions, quaternions or scales; pass only one of "
+            "them"
         )
     return similarity_of(matrix)
 
 
 def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
-    """Return the rotations (I, 4) of instances after the axis that is up in their
-    bundles was turned to another axis; `bundles` has one bundle, or I."""
+    """Return the rotations (I, 4) of instances after turning the up axis of their
+    bundles to another axis. `bundles` has one bundle for all instances, or I."""
     one_of(up, "up", AXES)
     turns = {bundle: turn_between(up_of_bundle(bundle), up) for bundle in set(bundles)}
     matrices = product_matrix(np.array([turns[bundle] for bundle in bundles]).reshape(-1, 4))
@@ -123,8 +126,8 @@ def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
 
 
 def up_of_bundle(bundle: Bundle) -> Axis:
-    """Return the axis that is up in a bundle according to its file, else -y, as in
-    trained assets."""
+    """Return the axis of a bundle that points up: the one declared in its file, else
+    -y, as in most trained assets."""
     recorded = bundle.config.get("up")
     if recorded in AXES:
         return cast(Axis, recorded)
@@ -132,8 +135,8 @@ def up_of_bundle(bundle: Bundle) -> Axis:
 
 
 def column(values: Array | None, name: str, count: int) -> Array:
-    """Return a contiguous copy (count, ...) of a column, or of its default for None. A
-    single row stands for all, except of positions."""
+    """Return a contiguous copy (count, ...) of a column, or of its default if `values`
+    is None. A single row applies to all instances, except for positions."""
     source: Array = values
     if values is None:
         source = _DEFAULTS.get(name)
@@ -161,8 +164,8 @@ def column(values: Array | None, name: str, count: int) -> Array:
             raise ValueError(f"{name}: expected {expected}, got {array[wrong][0]:g}")
     if name == "quaternions":
         largest = np.abs(array).max(axis=1, keepdims=True)
-        check("quaternions", largest.all(), "a rotation, got a quaternion of zeros")
-        array = array / largest  # so that squares neither overflow nor underflow
+        check("quaternions", largest.all(), "a nonzero quaternion, got zeros")
+        array = array / largest  # prevents overflow and underflow of squares
         array /= np.linalg.norm(array, axis=1, keepdims=True)
     if name in _ON_HOST:
         return np.ascontiguousarray(array, np.float32)
@@ -170,20 +173,20 @@ def column(values: Array | None, name: str, count: int) -> Array:
 
 
 def on_device_of(array: Array, values: Array) -> Array:
-    """Return the values as a tensor on the device of ``array``; unchanged if that is a
-    NumPy array."""
+    """Return the values as a tensor on the device of ``array``; return them unchanged
+    if ``array`` is a NumPy array."""
     if isinstance(array, np.ndarray):
         return values
     import torch
 
     if isinstance(values, np.ndarray):
-        values = np.array(values)  # a copy, because torch warns of arrays that are read-only
+        values = np.array(values)  # copied, because torch warns about read-only arrays
     return torch.as_tensor(values, device=array.device)
 
 
 def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
-    """Return both arrays on the device of the one that is a tensor; on the host if
-    neither is."""
+    """Return both arrays on the device of the one that is a tensor; on the host if both
+    are NumPy arrays."""
     target = first
     if isinstance(first, np.ndarray):
         target = second
@@ -191,13 +194,14 @@ def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
 
 
 def joined(first: Array, second: Array) -> Array:
-    """Return the concatenation of two arrays, on the device of either."""
+    """Return the concatenation of two arrays, on the device if either of them is
+    there."""
     first, second = _on_one_device(first, second)
     return _device.library_of(first).concatenate([first, second])
 
 
 def replaced(values: Array, rows: npt.NDArray[np.int64], row_values: Array) -> Array:
-    """Return a copy of an array with other values in some rows."""
+    """Return a copy of an array in which some rows are replaced."""
     values, row_values = _on_one_device(values, row_values)
     if isinstance(values, np.ndarray):
         values = values.copy()

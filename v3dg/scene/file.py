@@ -1,5 +1,5 @@
-"""Scene files: JSON with the bundles of a scene, the poses of their instances, and
-cameras."""
+"""Reads and writes scene files: JSON with the bundles of a scene, the poses of its
+instances, and cameras."""
 
 import copy
 import itertools
@@ -27,16 +27,16 @@ VERSION = 1
 _Subject = TypeVar("_Subject", Bundle, Scene)
 
 
-# Bounds on nested scenes: each file of a chain may place the next one many times.
+# Limits for nested scenes: in a chain of files, each may place the next one many times.
 _MOST_DEPTH = 16
 _MOST_INSTANCES = 1 << 24
 
 
 class _Instance(NamedTuple):
-    """A placed bundle or scene: the columns of `Scene.add`.
+    """A bundle or a nested scene with its pose and factors, as for `Scene.add`.
 
-    `node` is the place of a nested scene in its file; bundles, which may be many, have
-    None.
+    `node` is the place in the file, for messages. It is None for bundles, to save
+    memory.
     """
 
     subject: Bundle | Scene
@@ -50,8 +50,8 @@ class _Instance(NamedTuple):
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a file has the name of a scene: JSON, but not the `meta.json` of
-    an asset in SOG."""
+    """Return whether a file has the name of a scene: a .json that is not the
+    `meta.json` of an asset in SOG."""
     name = beside(path).name
     return name.endswith(".json") and not name.endswith(SUFFIXES)
 
@@ -59,27 +59,28 @@ def is_scene(path: Path) -> bool:
 def read_scene(
     path: str | os.PathLike[str], *, bundles: Mapping[str, Bundle] | None = None
 ) -> tuple[Scene, dict[str, Camera]]:
-    """Read a scene and its cameras, in file order, from a JSON file (docs/scene.md).
+    """Read a scene and its cameras from a JSON file (docs/scene.md). The cameras are in
+    the order of the file.
 
-    The layout files of the V3DG paper's published code are read too.
+    The layout files of the published code of the V3DG paper can be read, too.
 
     Args:
-        bundles: Bundles that are already open, by their path in the file (for a
-            published layout, by the name of the asset); the others are opened, relative
-            to the file's folder.
+        bundles: Bundles that are already open, by their path in the file (in a
+            published layout, by the name of the asset). Paths of all other bundles are
+            relative to the folder of the scene's file.
 
     Raises:
-        ValueError: The content is not valid; the message names the place in the file.
-        FileNotFoundError: The file, or a bundle that it names, does not exist.
+        ValueError: The content is invalid; the message names the place in the file.
+        FileNotFoundError: The file, or a bundle to which it refers, does not exist.
     """
     path = Path(path)
     if bundles is not None:
-        check_type("bundles", bundles, Mapping, "bundles by their paths")
+        check_type("bundles", bundles, Mapping, "a mapping from paths to bundles")
     return _Files().read(path, dict(bundles or {}))
 
 
 class _Files:
-    """The files of a scene and of those that it nests: each is read once."""
+    """The files of a scene and of its nested scenes. Each file is read once."""
 
     def __init__(self) -> None:
         self._scenes: dict[str, Scene] = {}
@@ -87,8 +88,8 @@ class _Files:
         self._chain: list[str] = []
 
     def read(self, path: Path, opened: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
-        """Return a scene and its cameras; bundles that are already open are used
-        again."""
+        """Return a scene and its cameras, using the bundles in `opened` that are
+        already open."""
         root = read_json(path)
         self._chain.append(os.path.realpath(path))
         if root.has("layouts"):
@@ -101,7 +102,7 @@ class _Files:
         return result
 
     def nested(self, node: Node, folder: Path) -> Scene:
-        """Return the scene in a file that another one names."""
+        """Return the nested scene in a file to which another file refers."""
         path = folder / node.text()
         real_path = os.path.realpath(path)
         if real_path in self._chain:
@@ -110,11 +111,11 @@ class _Files:
                 f"expected scenes that do not contain themselves, got {' > '.join(names)}"
             )
         if len(self._chain) >= _MOST_DEPTH:
-            raise node.problem(f"expected at most {_MOST_DEPTH} scenes inside each other, got more")
+            raise node.problem(f"expected at most {_MOST_DEPTH} nested scenes, got more")
         if not path.is_file():
             raise FileNotFoundError(str(node.problem(f"expected a scene at {path}, got none")))
         if not is_scene(path):
-            raise node.error("a file name ending in .json, not meta.json")
+            raise node.error("the name of a scene's file, which ends in .json")
         if real_path not in self._scenes:
             self._scenes[real_path] = self.read(path, {})[0]
         return self._scenes[real_path]
@@ -122,7 +123,7 @@ class _Files:
     def open_bundles(
         self, nodes: Mapping[str, Node], folder: Path, opened: dict[str, Bundle]
     ) -> dict[str, Bundle]:
-        """Return bundles by name, including those that an earlier file has opened."""
+        """Return bundles by name, using those that are already open."""
         real_paths = {
             node.text(): os.path.realpath(folder / node.text()) for node in nodes.values()
         }
@@ -143,21 +144,21 @@ def write_scene(
     bundle_paths: list[str] | None = None,
     cameras: Mapping[str, Camera] | None = None,
 ) -> None:
-    """Write a scene and named cameras as JSON (docs/scene.md); reading it back gives
-    the same numbers.
+    """Write a scene and named cameras as JSON (docs/scene.md). `read_scene` returns the
+    same numbers.
 
     Args:
-        bundle_paths: One path for each of ``scene.bundles``, relative to the file's
-            folder; if None, the files that they were opened from.
+        bundle_paths: A path for each of ``scene.bundles``, relative to the folder of
+            the new file; None uses the files from which they were opened.
 
     Raises:
         ValueError: The number of paths is wrong; a bundle was not opened from a file
-            (write it and open that); or the name is not one of a scene.
+            and has no path; or the file name is not that of a scene.
     """
     check(
         path,
         is_scene(Path(path)),
-        "a file name ending in .json, not meta.json; v3dg.open needs it",
+        "a file name ending in .json (but not meta.json), by which v3dg.open recognises scenes",
     )
     check_type("scene", scene, Scene, "a Scene")
     cameras = cameras or {}
@@ -197,19 +198,20 @@ def _camera_as_json(name: str, camera: Camera) -> dict[str, object]:
 
 
 def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
-    """Return the files that the bundles were opened from, relative to a folder;
-    ValueError for a bundle without a file."""
+    """Return the files from which the bundles were opened, relative to a folder; raise
+    ValueError for a bundle without a local file."""
     paths = []
     for number, bundle in enumerate(scene.bundles):
         if not bundle.path or is_url(bundle.path):
-            problem = "got one in memory or at a URL; write it to a file and open that"
-            refuse(f"scene.bundles[{number}]", f"one that was opened from a file, {problem}")
+            problem = "got one in memory or at a URL; write it to a file and open that file"
+            refuse(f"scene.bundles[{number}]", f"a bundle from a file, {problem}")
         paths.append(os.path.relpath(bundle.path, folder))
     return paths
 
 
 def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]]:
-    """Return the instances of a scene as JSON; `names` are those of its bundles."""
+    """Return the instances of a scene as JSON values; `names` are the names of its
+    bundles."""
     bundles = scene.instance_bundle.tolist()
     positions = scene.positions.tolist()
     quaternions = scene.quaternions.tolist()
@@ -239,7 +241,7 @@ def _read_scene(
     if top["format"].value != FORMAT:
         raise top["format"].error(f'"{FORMAT}"')
     if top["version"].value != VERSION or isinstance(top["version"].value, bool):
-        raise top["version"].error(f"{VERSION}, which is what this build reads")
+        raise top["version"].error(f"version {VERSION}, the only one that can be read")
     scene = Scene()
     if "up" in top:
         up = top["up"].text()
@@ -253,7 +255,7 @@ def _read_scene(
 
 
 class _Subjects(NamedTuple):
-    """What a scene places, by name."""
+    """The bundles and the nested scenes of a file, by name."""
 
     bundles: dict[str, Bundle]
     scenes: dict[str, Scene]
@@ -278,12 +280,12 @@ _POSE = ("position", "quaternion", "scale")
 
 
 def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
-    """Return an instance of a scene file; if it names an axis that is up, its scene
-    takes that axis."""
+    """Return an instance in a scene file. If it has the field `up`, the up axis of the
+    scene is set to that axis."""
     optional = ("bundle", "scene", *_POSE, "matrix", "up", "importance", "opacity", "tint")
     fields = node.fields((), optional)
     if ("bundle" in fields) == ("scene" in fields):
-        raise node.error("either the field bundle or the field scene")
+        raise node.error("exactly one of the fields bundle and scene")
     if "matrix" not in fields:
         node.field("position")
     elif any(name in fields for name in _POSE):
@@ -299,7 +301,7 @@ def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
     up = fields["up"].text()
     turn = node.attempt(lambda: turn_of(subject, cast(Axis, up)))
     if scene.up not in (None, up):
-        raise fields["up"].error(f"{scene.up}, which is up in this scene")
+        raise fields["up"].error(f"{scene.up}, the up axis of the other instances")
     scene.up = cast(Axis, up)
     quaternion = product(normalised(np.array(instance.quaternion)), turn)
     return instance._replace(quaternion=quaternion.tolist())
@@ -308,13 +310,13 @@ def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
 def _named(node: Node, subjects: Mapping[str, _Subject], kind: str) -> _Subject:
     name = node.text()
     if name not in subjects:
-        raise node.error(f"a name from {kind}")
+        raise node.error(f"a name in {kind}")
     return subjects[name]
 
 
 def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
-    """Add instances, whose ids are their numbers in the file unless scenes are nested;
-    neighbouring bundles are added at once."""
+    """Add instances to a scene, in the order of the file. Neighbouring instances of
+    bundles are added in one step."""
     for is_nested, run in itertools.groupby(instances, lambda i: isinstance(i.subject, Scene)):
         if not is_nested:
             _add_bundles(scene, list(run))
@@ -323,7 +325,9 @@ def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
             inner = cast(Scene, instance.subject)
             assert instance.node is not None
             if len(scene) + len(inner) > _MOST_INSTANCES:
-                expected = f"at most {_MOST_INSTANCES:,} instances with those of nested scenes"
+                expected = (
+                    f"at most {_MOST_INSTANCES:,} instances, including those of nested scenes"
+                )
                 raise instance.node.problem(f"expected {expected}, got more")
             scene.add_scene(
                 inner,
@@ -396,33 +400,33 @@ def _pose_of(node: Node) -> tuple[list[float], list[float], float]:
 def _opacity(node: Node) -> float:
     opacity = node.number()
     if not 0 <= opacity <= 1:
-        raise node.error("a number of 0 to 1")
+        raise node.error("a number from 0 to 1")
     return opacity
 
 
 def _tint(node: Node) -> list[float]:
     tint = node.vector(3)
     if min(tint) < 0 or max(tint) > MOST_FLOAT:
-        raise node.error("3 numbers of 0 or more that a float32 can hold")
+        raise node.error("3 numbers of at least 0 that a float32 can hold")
     return tint
 
 
 def _quaternion(node: Node) -> list[float]:
     quaternion = node.vector(4)
     if not any(quaternion):
-        raise node.error("a quaternion that is not zero")
+        raise node.error("a nonzero quaternion")
     return quaternion
 
 
 def _importance(node: Node) -> float:
     importance = node.positive()
-    if not LEAST_FLOAT <= importance <= MOST_FLOAT:  # a scene stores it as float32
+    if not LEAST_FLOAT <= importance <= MOST_FLOAT:  # the scene stores it as float32
         raise node.error("a positive number that a float32 can hold")
     return importance
 
 
 def _scene_of(instances: list[_Instance]) -> Scene:
-    """Return a scene of the instances, whose ids are their numbers in the file."""
+    """Return a scene of these instances, in the order of the file."""
     scene = Scene()
     _add_all(scene, instances)
     return scene
@@ -451,7 +455,7 @@ def _read_camera(node: Node, fields: dict[str, Node]) -> Camera:
     has_matrices = "viewmat" in fields and "K" in fields
     has_points = "eye" in fields and "target" in fields
     if has_matrices == has_points or (has_matrices and ("up" in fields or "fov_x" in fields)):
-        raise node.error("either viewmat and K, or eye and target (with up and fov_x)")
+        raise node.error("either viewmat and K, or eye and target (optionally with up and fov_x)")
     if has_points and ("distortion" in fields or "model" in fields):
         raise node.error("viewmat and K with a model and distortion")
     if has_matrices:
@@ -475,11 +479,11 @@ def _read_camera(node: Node, fields: dict[str, Node]) -> Camera:
 def _read_layouts(
     root: Node, folder: Path, opened: dict[str, Bundle]
 ) -> tuple[Scene, dict[str, Camera]]:
-    """Read a layout of the paper's published code; fields that only its programs use
-    are ignored."""
+    """Read a layout file of the paper's published code. Fields that only affect its own
+    programs are ignored."""
     layouts = list(root.field("layouts").items())
     if len(layouts) != 1:
-        advice = "each layout is a scene, so make a file of each"
+        advice = "each layout is a scene, so split the file"
         raise root.field("layouts").problem(f"expected one layout, got {len(layouts)}; {advice}")
     top = layouts[0].some_fields(("assets", "cameras"))
     instances_of_assets: list[tuple[str, Node]] = []
@@ -489,7 +493,7 @@ def _read_layouts(
         kind = fields["asset_kind"].text()
         name = fields["asset_name"].text()
         suffix = fields["ply_suffix"].text()
-        # The output of `v3dg build` in a copy of the published code's folders.
+        # The output of `v3dg build` in the folders of the published code.
         built = os.path.join(
             "..", "_3dgs-assets", kind, name, os.path.splitext(suffix)[0] + ".v3dg"
         )
@@ -513,7 +517,7 @@ def _read_layouts(
 def _read_flat_layout(
     root: Node, folder: Path, opened: dict[str, Bundle]
 ) -> tuple[Scene, dict[str, Camera]]:
-    """Read a published layout of one asset, which has shorter names for the fields."""
+    """Read a published layout of one asset, whose fields have shorter names."""
     top = root.fields(("asset", "instances", "cameras"), ("name", "convention"))
     asset = top["asset"].text()
     _open_bundles({asset: (top["asset"], [os.path.splitext(asset)[0] + ".v3dg"])}, folder, opened)
@@ -526,8 +530,8 @@ def _read_flat_layout(
 
 
 def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[str, Camera]:
-    """Return cameras in Blender's convention by name; if names repeat, each is prefixed
-    with its number."""
+    """Return cameras in Blender's convention, by name. If a name occurs twice, all
+    names are prefixed with the camera's number."""
     names = []
     cameras = []
     for node in nodes:
@@ -551,8 +555,8 @@ def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[
 def _open_bundles(
     candidates: dict[str, tuple[Node, list[str]]], folder: Path, opened: dict[str, Bundle]
 ) -> None:
-    """Add bundles to ``opened``: for each key the first of its paths, relative to the
-    folder, that exists."""
+    """Add bundles to ``opened``. `candidates` has, for each key, possible paths
+    relative to the folder; the first existing one is opened."""
     files: dict[str, Path] = {}
     for key, (node, names) in candidates.items():
         if key in opened:
@@ -562,7 +566,7 @@ def _open_bundles(
         if file is None:
             tried = " or ".join(map(str, paths))
             problem = node.problem(
-                f"expected a bundle at {tried}, got none; build it with `v3dg build`"
+                f"expected a bundle at {tried}, got no file; build it with `v3dg build`"
             )
             raise FileNotFoundError(str(problem))
         files[key] = file

@@ -1,4 +1,4 @@
-"""Scenes: bundles placed many times by similarity transforms."""
+"""Scenes: instances of bundles, placed by similarity transforms."""
 
 import copy
 import os
@@ -28,8 +28,8 @@ from v3dg.scene.columns import (
     up_of_bundle,
 )
 
-# Held during every change of a scene. Also held during fork(), so that it is never
-# locked in the child.
+# Held during every change of a scene, and during fork(), so that it is never locked in
+# a child process.
 _lock = threading.RLock()
 os.register_at_fork(
     before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release
@@ -37,7 +37,7 @@ os.register_at_fork(
 
 
 class _State(NamedTuple):
-    """A scene at one moment. It is immutable: a change replaces it by another."""
+    """The state of a scene. It is immutable: each change of the scene replaces it."""
 
     bundles: tuple[Bundle, ...]
     bundle: npt.NDArray[np.int32]
@@ -51,17 +51,18 @@ class _State(NamedTuple):
 
 
 class Scene:
-    """Instances of bundles: each bundle is stored once, and an instance maps p to scale
+    """A set of instances of bundles. Each bundle is stored once; an instance transforms
+    its points by p -> scale
     * rotation p + position.
 
-    Instances are numbered from 0 in the order in which they were added; `remove` closes
-    the gaps. Changes are visible in the next picture. Any thread may change a scene and
-    draw it: each change is atomic. A copy has the same bundles, and later changes of
-    one do not affect the other.
+    Instances are numbered from 0 in the order in which they were added; after `remove`,
+    the remaining ones are renumbered. Changes are visible in the next picture. Several
+    threads may change and draw a scene; each change is atomic. A copy of a scene has
+    the same bundles, and later changes of either scene do not affect the other.
 
-    Poses may be NumPy arrays, or torch tensors on the host or on a CUDA device. Those
-    on a device stay there and their values are not checked: an instance whose pose is
-    not finite, or whose scale is not positive, is not drawn.
+    Poses may be NumPy arrays, or torch tensors on the host or on a CUDA device. Poses
+    on a device stay there, and their values are not checked: an instance is not drawn
+    if its pose is not finite or its scale is not positive.
     """
 
     _up: Axis | None = None
@@ -86,7 +87,7 @@ class Scene:
 
     @classmethod
     def of(cls, subject: "Scene | Bundle") -> "Scene":
-        """Return a scene as it is, and a bundle as a scene of one instance at the
+        """Return a scene unchanged, or a bundle as a scene with one instance at the
         origin."""
         if isinstance(subject, Scene):
             return subject
@@ -97,7 +98,8 @@ class Scene:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Scene":
-        """Read a scene without its cameras; the same as `v3dg.read_scene(path)[0]`."""
+        """Read a scene without its cameras: the result of
+        `v3dg.read_scene(path)[0]`."""
         from v3dg.scene.file import read_scene
 
         return read_scene(path)[0]
@@ -105,8 +107,7 @@ class Scene:
     def save(
         self, path: str | os.PathLike[str], cameras: Mapping[str, Camera] | None = None
     ) -> None:
-        """Write the scene; the same as `v3dg.write_scene(path, self,
-        cameras=cameras)`."""
+        """Write the scene and named cameras with `v3dg.write_scene`."""
         from v3dg.scene.file import write_scene
 
         write_scene(path, self, cameras=cameras)
@@ -124,32 +125,33 @@ class Scene:
         opacity: npt.ArrayLike = 1.0,
         tint: npt.ArrayLike = (1.0, 1.0, 1.0),
     ) -> range:
-        """Place a bundle I times and return the ids of the new instances.
+        """Add I instances of a bundle and return their ids.
 
         Args:
-            bundle: One for all, also by its file, or a sequence of I.
-            positions: (I, 3), or (3,) for one instance; world units; the origin if
-                None.
-            quaternions: (I, 4) or (4,) w x y z of any length but zero; no rotation if
-                None.
-            scales: (I,) or one number for all, > 0; 1 if None.
-            importance: (I,) or one number for all, > 0. An instance of importance 4 is
-                drawn as if the tolerance were a quarter.
-            matrix: (I, 4, 4) or (4, 4), in place of positions, quaternions and scales:
-                the transform of column vectors, which may turn, move and scale alike
-                along all axes.
-            up: The axis that is up in the scene. What is up in the bundle (as its file
-                says, else -y, as in trained assets) is turned to it before the pose
-                applies. It becomes the scene's `up` if that is None.
-            opacity: (I,) or one number for all, 0 to 1: factor of the opacities of the
-                gaussians. An instance of opacity 0 is not drawn and costs nothing.
-            tint: (I, 3) or (3,) for all, >= 0: factors of red, green and blue, once the
-                colours are known and clamped at 0.
+            bundle: A bundle or the path of its file; or a sequence of I bundles, one
+                for each instance.
+            positions: (I, 3), or (3,) for one instance, in world units; None means the
+                origin.
+            quaternions: (I, 4), or (4,) for all instances, w x y z; they need not be
+                normalised. None means no rotation.
+            scales: (I,), or one number for all instances, > 0; None means 1.
+            importance: (I,), or one number for all instances, > 0. The cut of an
+                instance is selected as if the tolerance were divided by its importance.
+            matrix: (I, 4, 4), or (4, 4) for one instance, instead of positions,
+                quaternions and scales: transforms of column vectors, composed of
+                rotation, translation and uniform scale.
+            up: The axis that points up in the scene. The up axis of the bundle
+                (declared in its file, otherwise -y) is turned to this axis before the
+                pose is applied. If the scene's `up` is None, it is set to this axis.
+            opacity: (I,), or one number for all instances, 0 to 1: factor of the
+                opacities of gaussians. Instances with opacity 0 are skipped.
+            tint: (I, 3), or (3,) for all instances, >= 0: factors of red, green and
+                blue. They multiply the evaluated colours, after these are clamped at 0.
 
         Raises:
-            TypeError: ``bundle`` is not a bundle.
-            ValueError: A shape or a value is not as above, the matrix is no similarity
-                (it shears, mirrors or stretches), or ``up`` is not the scene's.
+            TypeError: ``bundle`` is not a Bundle.
+            ValueError: A shape or a value is invalid, a matrix is not a similarity
+                transform, or ``up`` differs from the scene's `up`.
         """
         bundles = _bundles_of(bundle)
         if matrix is not None:
@@ -157,7 +159,11 @@ class Scene:
         rows = columns_of(positions, quaternions, scales, importance, opacity, tint)
         count = len(rows.importance)
         if isinstance(bundle, list | tuple):
-            check("bundle", len(bundles) == count, f"one for all or {count}, got {len(bundles)}")
+            check(
+                "bundle",
+                len(bundles) == count,
+                f"one for all instances or a list of {count}, got {len(bundles)}",
+            )
         if up is not None:
             rows = rows._replace(quaternions=turned(rows.quaternions, bundles, up))
         return self._append(bundles, rows, up)
@@ -175,15 +181,16 @@ class Scene:
         opacity: float = 1.0,
         tint: npt.ArrayLike = (1.0, 1.0, 1.0),
     ) -> range:
-        """Place all instances of another scene as a whole and return their ids here.
+        """Add all instances of another scene, placed as a whole, and return their ids
+        in this scene.
 
         Poses are composed; importance, opacity and tint are multiplied. Later changes
         of the other scene have no effect. The arguments are those of `add` for one
-        instance; a scene whose `up` is None has z up.
+        instance. If the other scene's `up` is None, z is used.
 
         Raises:
-            TypeError: ``scene`` is no scene.
-            ValueError: As in `add`.
+            TypeError: ``scene`` is not a Scene.
+            ValueError: See `add`.
         """
         check_type("scene", scene, Scene, "a Scene")
         if position is not None:
@@ -196,7 +203,7 @@ class Scene:
         if matrix is not None:
             parts = parts_of(matrix, *parts)
         outer = columns_of(*parts, importance, opacity, tint)
-        check("position", len(outer.importance) == 1, f"one, got {len(outer.importance)}")
+        check("position", len(outer.importance) == 1, f"one position, got {len(outer.importance)}")
         inner = copy.copy(scene)  # other threads may change the original meanwhile
         if up is not None:
             turned_quaternions = product(outer.quaternions, turn_of(inner, up))
@@ -213,7 +220,7 @@ class Scene:
         return self._append(bundles, composed(outer, columns), up)
 
     def _append(self, bundles: Sequence[Bundle], rows: Columns, up: Axis | None) -> range:
-        """Append instances of one bundle, or of one for each; returns their ids."""
+        """Append instances of one bundle, or of one bundle each; return their ids."""
         count = len(rows.importance)
         with _lock:
             self._take_up(up)
@@ -236,8 +243,7 @@ class Scene:
         return range(first, first + count)
 
     def remove(self, ids: Array | npt.ArrayLike) -> None:
-        """Remove instances; the ids of those that follow decrease, as in
-        `numpy.delete`."""
+        """Remove instances. Later instances are renumbered, as in `numpy.delete`."""
         with _lock:
             state = self._state
             is_left = np.ones(len(self), bool)
@@ -263,25 +269,30 @@ class Scene:
         matrix: Array | npt.ArrayLike | None = None,
         up: Axis | None = None,
     ) -> None:
-        """Give instances new poses; a part that is None does not change.
+        """Change the poses of instances. Parts that are None do not change.
 
         Args:
-            ids: (M,) which instances; all if None.
-            positions: (M, 3).
-            quaternions: (M, 4) or (4,) for all of them.
-            scales: (M,) or one number for all of them.
-            matrix: (M, 4, 4), or (4, 4) for one instance, in place of the three above.
-            up: As in `add`, with new quaternions or matrices: what is up in the bundles
-                is turned to this axis before the new rotation applies.
+            ids: (M,) indices of the instances; None means all.
+            positions: (M, 3) new positions.
+            quaternions: (M, 4), or (4,) for all of them: new rotations.
+            scales: (M,), or one number for all of them: new scales.
+            matrix: (M, 4, 4), or (4, 4) for one instance, instead of positions,
+                quaternions and scales.
+            up: As in `add`; requires new quaternions or matrices. The up axis of the
+                bundles is turned to this axis before the new rotation is applied.
 
         Raises:
             IndexError: There is no such instance.
-            ValueError: A shape or a value is not as in `add`.
+            ValueError: A shape or a value is invalid, see `add`.
         """
         if matrix is not None:
             positions, quaternions, scales = parts_of(matrix, positions, quaternions, scales)
         if up is not None:
-            check("up", quaternions is not None, "quaternions or a matrix beside up, got neither")
+            check(
+                "up",
+                quaternions is not None,
+                "quaternions or a matrix together with up, got neither",
+            )
         parts = {"positions": positions, "quaternions": quaternions, "scales": scales}
         with _lock:
             rows = self._ids(ids)
@@ -302,17 +313,15 @@ class Scene:
     def set_importance(
         self, importance: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None
     ) -> None:
-        """Give instances another importance, as in `add`; all of them if ``ids`` is
-        None."""
+        """Change the importance of instances, see `add`; if ``ids`` is None, of all."""
         self._set("importance", importance, ids)
 
     def set_opacity(self, opacity: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Give instances another opacity, as in `add`; all of them if ``ids`` is
-        None."""
+        """Change the opacity of instances, see `add`; if ``ids`` is None, of all."""
         self._set("opacity", opacity, ids)
 
     def set_tint(self, tint: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Give instances another tint, as in `add`; all of them if ``ids`` is None."""
+        """Change the tint of instances, see `add`; if ``ids`` is None, of all."""
         self._set("tint", tint, ids)
 
     def _set(self, name: str, values: npt.ArrayLike, ids: Array | npt.ArrayLike | None) -> None:
@@ -322,16 +331,16 @@ class Scene:
             self._publish(self._state._replace(**{name: changed}), changes=1)
 
     def _take_up(self, up: Axis | None) -> None:
-        """Set the axis that is up, or refuse one that is not the scene's; the lock must
-        be held."""
+        """Set the up axis; raise ValueError if the scene has a different one. The lock
+        must be held."""
         if up is None:
             return
         is_same = self._up in (None, up)
-        check("up", is_same, f"{self._up}, which is up in this scene, got {up}")
+        check("up", is_same, f"{self._up}, the up axis of this scene, got {up}")
         self._up = up
 
     def _publish(self, state: _State, changes: int = 0, moves: int = 0, removals: int = 0) -> None:
-        """Replace the state in one step and count the revision up; the lock must be
+        """Replace the state atomically and increase the revision. The lock must be
         held."""
         num_changes, num_moves, num_removals = self.revision
         revision = (num_changes + changes, num_moves + moves, num_removals + removals)
@@ -339,8 +348,8 @@ class Scene:
 
     @property
     def up(self) -> Axis | None:
-        """The axis that is up; None if it is not known, so that viewers and exports may
-        guess it."""
+        """The axis that points up; None if unknown. Viewers and exports then guess
+        it."""
         return self._up
 
     @up.setter
@@ -356,37 +365,37 @@ class Scene:
 
     @property
     def revision(self) -> tuple[int, int, int]:
-        """Numbers of changes so far: instances added, removed or given another
-        importance; moves; removals.
+        """Numbers of changes so far: first of changes other than poses, then of changes
+        of poses, then of removals (which are also counted in the first).
 
-        A program that caches something of the scene compares them to find out when it
-        is stale.
+        Programs can use the revision to detect that data derived from the scene is
+        outdated.
         """
         return self._state.revision
 
     @property
     def instance_bundle(self) -> npt.NDArray[np.int32]:
-        """(I,) int32, the number of each instance's bundle; read-only."""
+        """(I,) int32, the index of each instance's bundle in `bundles`; read-only."""
         return self._state.bundle
 
     @property
     def importance(self) -> npt.NDArray[np.float32]:
-        """(I,) float32; read-only."""
+        """(I,) float32, the importance of each instance; read-only."""
         return self._state.importance
 
     @property
     def opacity(self) -> npt.NDArray[np.float32]:
-        """(I,) float32, 0 to 1; read-only."""
+        """(I,) float32, the opacity of each instance, 0 to 1; read-only."""
         return self._state.opacity
 
     @property
     def tint(self) -> npt.NDArray[np.float32]:
-        """(I, 3) float32; read-only."""
+        """(I, 3) float32, the tint of each instance; read-only."""
         return self._state.tint
 
     @property
     def factors(self) -> npt.NDArray[np.float32] | None:
-        """(I, 4) float32, factors of red, green, blue and opacity; None if all
+        """(I, 4) float32, factors of red, green, blue and opacity; None if all factors
         are 1."""
         state = self._state
         if (state.opacity == 1).all() and (state.tint == 1).all():
@@ -395,8 +404,8 @@ class Scene:
 
     @property
     def positions(self) -> Floats:
-        """(I, 3) float64, world units; a copy if they are on a device. Use `move` to
-        change them."""
+        """(I, 3) float64 in world units; a copy if the poses are on a device. Use
+        `move` to change positions."""
         return _device.to_host(self._state.positions)
 
     @property
@@ -406,29 +415,29 @@ class Scene:
         if isinstance(rows, np.ndarray):
             return rows
         quaternions = normalised(_device.to_host(rows))
-        # An instance with a zero quaternion is not drawn.
+        # Instances with a zero quaternion are not drawn.
         quaternions[~quaternions.any(axis=1)] = np.nan
         return quaternions
 
     @property
     def scales(self) -> Floats:
-        """(I,) float64."""
+        """(I,) float64, the scale of each instance."""
         return _device.to_host(self._state.scales)
 
     @property
     def rotations(self) -> Floats:
-        """(I, 3, 3) float64, of the quaternions."""
+        """(I, 3, 3) float64, the rotation matrices of the quaternions."""
         return rotation_from_quaternion(self.quaternions)
 
     @property
     def poses(self) -> tuple[Array, Array, Array]:
-        """Positions, quaternions and scales, not copied: NumPy arrays, or tensors on a
-        CUDA device."""
+        """Positions, quaternions and scales without copying: NumPy arrays, or tensors
+        on a CUDA device."""
         state = self._state
         return state.positions, state.quaternions, state.scales
 
     def _ids(self, ids: Array | None) -> npt.NDArray[np.int64]:
-        """Return checked ids of instances; for None, those of all instances."""
+        """Return checked indices of instances; all indices if `ids` is None."""
         count = len(self)
         if ids is None:
             return np.arange(count)
@@ -438,7 +447,7 @@ class Scene:
         if rows.size == 0:
             return np.zeros(0, np.int64)
         fits = rows.ndim == 1 and np.issubdtype(rows.dtype, np.integer)
-        check("ids", fits, f"whole numbers (M,), got {rows.dtype} of shape {rows.shape}")
+        check("ids", fits, f"integers of shape (M,), got {rows.dtype} of shape {rows.shape}")
         wrong = (rows < 0) | (rows >= count)
         if wrong.any():
             raise IndexError(f"ids: expected 0 to {count - 1}, got {rows[wrong][0]}")
@@ -454,8 +463,8 @@ class Scene:
 
 
 def turn_of(subject: Scene | Bundle, up: Axis) -> Floats:
-    """Return the quaternion (4,) w x y z that turns the axis that is up in a scene or a
-    bundle to another one; ValueError if there is no such axis."""
+    """Return the quaternion (4,) w x y z that turns the up axis of a scene or a bundle
+    to another axis; raise ValueError for an invalid axis."""
     one_of(up, "up", AXES)
     if isinstance(subject, Bundle):
         return turn_between(up_of_bundle(subject), up)
@@ -463,12 +472,12 @@ def turn_of(subject: Scene | Bundle, up: Axis) -> Floats:
 
 
 Subject: TypeAlias = Scene | Bundle | Gaussians
-"""A value that can be drawn."""
+"""Anything that can be drawn."""
 
 
 def _bundles_of(bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle]) -> list[Bundle]:
-    """Return the bundles of a list or a tuple, or a single bundle; each may be given by
-    its file."""
+    """Return the bundles in a list or a tuple, or a single bundle, which may be given
+    by its file."""
     if isinstance(bundle, str | os.PathLike):
         return [Bundle.open(bundle)]
     bundles: list[Bundle] = []

@@ -1,10 +1,10 @@
-"""The viewer of `v3dg view`: a web server whose pictures the renderer draws. Needs the
-extra `viewer`.
+"""The viewer of `v3dg view`: a web server that sends pictures of the renderer to
+browsers. Needs the extra `viewer`.
 
-`view` has the viewpoint of a tab, `frame` draws what the tab shows, `pacing` decides
-the size and the time of pictures, and `path` moves the camera along a path; these
-modules know no browser. `messages` and `answers` define the protocol between a page and
-the viewer. A `tab` is the server's half of a page, `exports` does its long work, `gate`
-decides who may connect, and `server` serves the page in `page/` and makes a tab for
-each browser that connects.
+These modules know nothing about browsers: `view` has the viewpoint of a tab, `frame`
+draws the pictures of a tab, `pacing` decides the size and the time of pictures, and
+`path` moves the camera along a path. `messages` and `answers` define the protocol
+between a page and the viewer. `tab` is the server's part of a connected page, `exports`
+does the long work of a tab, and `gate` decides who may connect. `server` serves the
+page in `page/`, and creates a tab for each browser that connects.
 """

@@ -1,5 +1,5 @@
-"""Messages from the viewer to a page: JSON of these kinds; binary data follows
-`Picture` and `File`.
+"""Messages from the viewer to a page: JSON objects of the types below. `Picture` and
+`File` are followed by binary data.
 
 `tests/support/page_protocol.py` generates the page's types from this module and
 `messages`.
@@ -21,7 +21,7 @@ Color: TypeAlias = tuple[int, int, int]
 
 
 class FileCamera(msgspec.Struct):
-    """A camera of the file.
+    """A named camera of the subject's file.
 
     Attributes:
         photograph: Whether the photograph of this camera is available.
@@ -51,9 +51,9 @@ class Hello(msgspec.Struct, tag="hello"):
     """The first message of a connection.
 
     Attributes:
-        version: Version of the viewer; a page of another version reloads itself.
-        up: The direction that is up, in the world.
-        asks_up: Whether `up` is only assumed, so that the page asks the user.
+        version: Version of the viewer. A page of another version reloads itself.
+        up: The direction that points up in the world.
+        asks_up: Whether `up` is only assumed; then the page asks the user.
         settings: The initial settings of a tab.
         defaults: The default of each setting.
     """
@@ -68,10 +68,10 @@ class Hello(msgspec.Struct, tag="hello"):
 
 
 class Home(msgspec.Struct):
-    """The first view of a tab in a window of a certain aspect.
+    """The first view of a tab in a window with a certain aspect ratio.
 
     Attributes:
-        focus: The point that orbits go around.
+        focus: The point around which the camera orbits.
     """
 
     view: View
@@ -82,21 +82,21 @@ class Scene(msgspec.Struct, tag="scene"):
     """The subject that the tab shows from now on.
 
     Attributes:
-        center, radius: A ball that contains nearly all of it, world units.
-        near: Distance of the near plane, world units.
-        homes: First views, from narrow windows to wide ones.
+        center, radius: A ball that contains nearly all of the subject, in world units.
+        near: Depth of the near plane, in world units.
+        homes: First views for windows from narrow to wide.
         instances: Number of instances.
-        has_files: Whether all its bundles are in files, so that the scene can be saved.
-        writes_files: Whether the server writes new assets, beside the file that is
-            shown; otherwise the browser saves them.
+        has_files: Whether all bundles are in files, so that the scene can be saved.
+        writes_files: Whether the server writes new assets beside the file of the
+            subject; otherwise the browser saves them.
         level_colors: Colour of each level.
-        ramp: Colours from the smallest value to the largest.
-        most_counted: Number of gaussians in a pixel that gets the last colour of the
-            ramp.
+        ramp: Colours for values from the smallest to the largest.
+        most_counted: Number of gaussians in a pixel at which the last colour of the
+            ramp is reached.
         modes: The available display modes.
         shows_cuts: Whether freezing, splitting and picking are available.
-        missing_colors: Colours of gaussians whose pages miss no, one, two and three
-            levels.
+        missing_colors: Colours of gaussians that are drawn in place of no, one, two and
+            three missing finer levels.
     """
 
     name: str
@@ -120,7 +120,8 @@ class Figures(msgspec.Struct):
 
     Attributes:
         gaussians_selected, gaussians_in_frustum, tolerance, select_ms, draw_ms, levels,
-        missing: See `v3dg.Stats`. memory_bytes: Memory of the viewer's process.
+            missing: See `v3dg.Stats`. memory_bytes: Memory of the viewer's process in
+            bytes.
     """
 
     gaussians_selected: int
@@ -134,7 +135,7 @@ class Figures(msgspec.Struct):
 
 
 class Picture(msgspec.Struct, tag="picture"):
-    """A picture, as the bytes of a JPEG.
+    """A picture. The bytes of a JPEG follow.
 
     Attributes:
         final: Whether this is the last picture for its request.
@@ -143,8 +144,8 @@ class Picture(msgspec.Struct, tag="picture"):
         view: The viewpoint of the picture.
         range: The values of the darkest and the brightest colour, if colours represent
             values.
-        distance: Median depth around the middle, world units; null if nothing is there,
-            or if it is unknown.
+        distance: Median depth around the middle, in world units; null if nothing is
+            there, or if it is unknown.
     """
 
     final: bool
@@ -158,7 +159,7 @@ class Picture(msgspec.Struct, tag="picture"):
 
 
 class Failed(msgspec.Struct, tag="failed"):
-    """Says why the requested picture is not drawn."""
+    """The reason why the requested picture cannot be drawn."""
 
     text: str
 
@@ -170,7 +171,7 @@ class Notice(msgspec.Struct, tag="notice"):
 
 
 class Progress(msgspec.Struct, tag="progress"):
-    """Progress of the film that is being saved, 0 to 1."""
+    """Progress of the film that is being saved, from 0 to 1."""
 
     share: float
 
@@ -180,7 +181,7 @@ class Done(msgspec.Struct, tag="done"):
 
 
 class File(msgspec.Struct, tag="file"):
-    """A file to save, as bytes."""
+    """A file that the browser saves. Its bytes follow."""
 
     name: str
 
@@ -194,12 +195,13 @@ class Pose(msgspec.Struct):
 
 
 class Picked(msgspec.Struct, tag="picked"):
-    """The instance that was asked about; all fields are unset if there is none.
+    """The answer to `Pick`: an instance. All fields are unset if there is none.
 
     Attributes:
-        box: Lower and upper corner of its bundle, in the bundle's own coordinates.
+        box: Minimum and maximum corner of the instance's bundle, in the coordinates of
+            the bundle.
         bundle: Name of the bundle's file; empty if the bundle is not in a file.
-        point: The picked point, in the world.
+        point: The picked point in the world.
     """
 
     instance: int | UnsetType = UNSET
@@ -210,7 +212,7 @@ class Picked(msgspec.Struct, tag="picked"):
 
 
 class Play(msgspec.Struct, tag="play"):
-    """The views of a path, for playback."""
+    """The views of a path for playback."""
 
     fps: int
     views: list[View]
@@ -222,7 +224,7 @@ Answer: TypeAlias = (
 
 
 def encode(answer: Answer, data: bytes = b"") -> str | bytes:
-    """Return a message as text; with binary data, as the length of the text in four
+    """Return a message as text. With binary data, return the length of the text in four
     bytes (little-endian), the text, and the data."""
     text = msgspec.json.encode(answer)
     if not data:

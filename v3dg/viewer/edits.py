@@ -1,4 +1,5 @@
-"""New assets that a page asks for: their names, and the files that they become."""
+"""New assets that a page requests: checks of their names, and writing of their
+files."""
 
 import os
 from pathlib import Path
@@ -10,31 +11,31 @@ from v3dg.io import WRITE_SUFFIXES, write_asset
 
 
 def check_new_name(name: str) -> None:
-    """Raise ValueError unless a name is that of a file in a folder, visible, and ends
-    like an asset."""
+    """Raise ValueError unless a name is a visible file name without a folder and with
+    the suffix of an asset."""
     is_plain = is_one_line(name) and not name.startswith(".") and "/" not in name
-    check("name", is_plain and "\\" not in name, "a file name without a folder")
+    check("name", is_plain and "\\" not in name, "a file name without a folder, got another one")
     stem_is_there = not name.lower().startswith(WRITE_SUFFIXES)
     is_asset = name.lower().endswith(WRITE_SUFFIXES) and stem_is_there
     check("name", is_asset, f"a name ending in {', '.join(WRITE_SUFFIXES)}, got {name}")
 
 
 def write_new_asset(folder: Path, name: str, gaussians: Gaussians) -> None:
-    """Write an asset to a file that does not exist yet; nothing is ever overwritten.
+    """Write an asset to a new file. An existing file is never overwritten.
 
     Raises:
-        ValueError: There is a file of that name, or a value that the format cannot
-            hold.
+        ValueError: The file exists, or the format cannot represent a value.
         OSError: The file cannot be written.
     """
     check_new_name(name)
     path = folder / name
     try:
-        # The name is taken before the file is written, so that two pages cannot both
-        # write it.
+        # An empty file reserves the name first, so that two pages cannot both write it.
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except FileExistsError:
-        raise ValueError(f"{name}: there is such a file already; choose another name") from None
+        raise ValueError(
+            f"{name}: a file with this name already exists; choose another name"
+        ) from None
     try:
         write_asset(path, gaussians)
     except BaseException:

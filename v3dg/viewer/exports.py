@@ -1,4 +1,4 @@
-"""The long work of a tab, such as saving files, and the thread that does it."""
+"""Long work of a tab, such as saving files, and the thread that does it."""
 
 import contextlib
 import os
@@ -14,8 +14,8 @@ from v3dg.viewer.answers import Answer, Done, File, Notice
 
 
 def bundle_names(scene: Scene) -> list[str]:
-    """Return the paths of the scene's bundles, which must be files, relative to the
-    folder that contains all of them."""
+    """Return the paths of a scene's bundles relative to the innermost folder that
+    contains all of them. All bundles must be in files."""
     paths = [os.path.abspath(bundle.path or "") for bundle in scene.bundles]
     folder = os.path.commonpath([os.path.dirname(path) for path in paths] or ["/"])
     return [os.path.relpath(path, folder) for path in paths]
@@ -28,11 +28,12 @@ class Tell(Protocol):
 
 
 class Exporter:
-    """Does one piece of work at a time, in a thread, until it is done or stopped.
+    """Runs one piece of work at a time in a separate thread, until it is done or
+    stopped.
 
     Args:
-        tell: Sends an answer to the page; called in any thread.
-        explain: Turns an error into a line for the page.
+        tell: Sends a message to the page. It may be called from any thread.
+        explain: Converts an error to a line of text for the page.
     """
 
     def __init__(self, tell: Tell, explain: Callable[[Exception], str]) -> None:
@@ -44,10 +45,10 @@ class Exporter:
         self._stop = _core.Stop()
 
     def begin(self, work: Callable[[_core.Stop], None]) -> None:
-        """Start work, unless other work is in progress; then a notice says so.
+        """Start work. If other work is still in progress, send a notice instead.
 
-        The work must end soon after a stop is requested from its argument; its errors
-        become notices.
+        The work must end soon after its argument is set to stop. Errors of the work are
+        sent as notices.
         """
         with self._lock:
             if self._is_closed:
@@ -59,7 +60,7 @@ class Exporter:
                 )
                 self._thread.start()
                 return
-        busy = Notice("Still at work: stop it first, or wait.")
+        busy = Notice("Other work is still in progress: stop it first, or wait.")
         self._run(lambda _: self._tell(busy))
 
     def _run(self, work: Callable[[_core.Stop], None]) -> None:
@@ -72,19 +73,20 @@ class Exporter:
             self._tell(answer)
 
     def save(self, name: str, write: Callable[[Path], object]) -> None:
-        """Write a file, and make the browser save it."""
+        """Write a file to a temporary folder, and send it to the browser, which saves
+        it."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, name)
             write(path)
             self._tell(File(name), path.read_bytes())
 
     def stop(self) -> None:
-        """Ask the current work to end."""
+        """Request the end of the current work."""
         self._stop.request()
 
     def close(self, seconds: float) -> bool:
-        """Stop permanently; wait at most this long and return whether the thread has
-        ended."""
+        """Stop permanently. Wait at most `seconds` for the thread, and return whether
+        it has ended."""
         with self._lock:
             self._is_closed = True
         self.stop()

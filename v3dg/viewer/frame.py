@@ -1,5 +1,5 @@
-"""One picture of the viewer: a scene, a view and settings become pixels and
-statistics."""
+"""Draws one picture for the viewer: computes pixels and statistics from a scene, a view
+and settings."""
 
 import functools
 import threading
@@ -38,12 +38,13 @@ Shows: TypeAlias = Literal[
     "appearance", "level", "cluster", "error", "residency", "depth", "alpha", "count", "difference"
 ]
 
-# Number of gaussians in a pixel that gets the brightest colour.
+# Number of gaussians in a pixel at which the brightest colour is reached.
 MOST_COUNTED = 256
 _MODES_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
-# Up to this number, all gaussians are drawn even while the camera moves.
+# Up to this number of gaussians, all are drawn even while the camera moves.
 _FEW_GAUSSIANS = 500_000
-# Height of the picture for which a first view is framed; only its aspect counts.
+# Height in px of the picture for which a first view is computed. Only the aspect ratio
+# matters.
 _FIRST_PIXELS = 1000
 _SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
 
@@ -53,18 +54,19 @@ class Settings:
     """The content and quality of a picture.
 
     Attributes:
-        shows: The gaussians' colours; the colours of levels or clusters; the error,
-            which is the screen area per gaussian of a coarser cluster; expected depth;
-            alpha; the number of gaussians blended in a pixel; or the difference to the
-            picture of all gaussians.
-        tolerance, budget, min_level, fade: As in `v3dg.render`, but a tolerance is
-            always set.
-        gain: Factor of differences.
-        split: Fraction of the width, from the left, that shows all gaussians; 0 for
-            none.
-        frozen: The view that the cut is selected for; None for the view of the picture.
-        background: Red, green and blue, 0 to 1, behind colours of gaussians; the other
-            modes are drawn on black.
+        shows: The display mode: the gaussians' own colours; the colours of levels,
+            clusters or missing pages; the error, which is the screen area per gaussian
+            of a coarser cluster; expected depth; alpha; the number of gaussians that a
+            pixel blends; or the difference from the picture of all gaussians.
+        tolerance, budget, min_level, fade: As in `v3dg.render`, but the tolerance is
+            never None.
+        gain: Factor by which differences are multiplied.
+        split: Left part of the picture, as a fraction of its width, that shows all
+            gaussians; 0 for no split.
+        frozen: The view for which the cut is selected; None for the view of the
+            picture.
+        background: Red, green and blue, 0 to 1, behind the gaussians. Modes whose
+            colours represent values are drawn on black.
     """
 
     shows: Shows = "appearance"
@@ -80,18 +82,18 @@ class Settings:
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture.
+    """A finished picture.
 
     Attributes:
-        pixels: (H, W, 3).
-        figures: Its statistics; times are those of the whole picture, everything else
-            is of the cut.
-        shows: As in its settings.
+        pixels: (H, W, 3) uint8.
+        figures: Statistics of the cut, except that times are those of the whole
+            picture.
+        shows: The display mode, as in `Settings`.
         value_range: The values of the darkest and the brightest colour, if colours
             represent values.
         view: The viewpoint of the picture.
-        distance: Median depth around the middle, world units; None if nothing is there,
-            or if it is unknown.
+        distance: Median depth around the middle, in world units; None if nothing is
+            there, or if it is unknown.
     """
 
     pixels: Pixels
@@ -107,12 +109,12 @@ class Frame:
 
 
 class _Job(NamedTuple):
-    """How a picture is drawn.
+    """A picture to draw.
 
     Attributes:
-        chooser: The camera that the cut is selected for; None for the camera of the
+        chooser: The camera for which the cut is selected; None for the camera of the
             picture.
-        edge: The column at which the picture is split, px.
+        edge: The column in px at which the picture is split.
     """
 
     camera: Camera
@@ -124,13 +126,13 @@ class _Job(NamedTuple):
 
 
 class _Planes(NamedTuple):
-    """A window of a picture.
+    """The planes of a window of a picture.
 
     Attributes:
-        color: (H, W, 3).
-        alpha: (H, W).
-        depth: (H, W), or the number of gaussians blended in each pixel.
-        gaussians_in_frustum: Number in the whole picture.
+        color: (H, W, 3) premultiplied colour.
+        alpha: (H, W) opacity.
+        depth: (H, W) expected depth, or the number of gaussians that each pixel blends.
+        gaussians_in_frustum: Number of gaussians in the frustum.
     """
 
     color: _Float32
@@ -140,12 +142,12 @@ class _Planes(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """The input of painting a picture.
+    """The input of `_paint`.
 
     Attributes:
         color, alpha, depth: As in `_Planes`, for the part to the right of the split.
-        whole: Colours of all gaussians, from the left edge on, for comparison; None if
-            nothing is compared.
+        whole: The picture of all gaussians for comparison, from the left edge up to the
+            split or the right edge; None without a comparison.
         figures: The statistics of drawing.
     """
 
@@ -157,7 +159,8 @@ class _Drawn(NamedTuple):
 
 
 class _Painting(NamedTuple):
-    """The colours to the right of the split; the other two fields are as in `Frame`."""
+    """The colours of the part to the right of the split; the other fields are as in
+    `Frame`."""
 
     colors: _Float32
     value_range: tuple[float, float] | None
@@ -165,26 +168,26 @@ class _Painting(NamedTuple):
 
 
 class Stopped(Exception):
-    """A picture was abandoned because another one was requested."""
+    """Raised when a picture is abandoned because another one was requested."""
 
 
 class SceneView:
-    """Draws pictures of one scene, for any number of threads.
+    """Draws pictures of one scene. Several threads may use it.
 
     Args:
-        subject: A scene, a bundle, or an asset, which is split into clusters but gets
-            no coarser levels.
-        device: The device that draws: "cpu", "cuda", or "auto", which is CUDA if it
-            works.
+        subject: A scene, a bundle, or an asset. An asset is divided into clusters,
+            without coarser levels.
+        device: The device that draws: "cpu", "cuda", or "auto", which means CUDA if it
+            can be used.
         memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time.
-            Comparisons are then with the finest cut that fits into the pool, for the
-            cut's camera; on CUDA there are no comparisons.
+            Pictures are then compared with the finest cut that fits into the pool,
+            selected for the same camera; on CUDA, comparisons are not available.
 
     Attributes:
         scene: The subject as a scene.
-        near: As in `v3dg.Camera`, chosen by the scene's size.
-        center, radius: A ball that contains nearly all of it, world units.
-        pool: Draws if not everything is resident; otherwise None.
+        near: Depth of the near plane, chosen by the size of the scene, in world units.
+        center, radius: A ball that contains nearly all of the scene, in world units.
+        pool: The renderer with a pool; None if everything is resident.
     """
 
     def __init__(
@@ -211,24 +214,25 @@ class SceneView:
 
     @functools.cached_property
     def framing(self) -> Framing:
-        """The framing of the scene, which determines its first views."""
+        """The framing of the scene, which determines the first views."""
         return frame_subject(self.scene)
 
     def first_view(self, up: VectorLike, aspect: float) -> tuple[View, Floats]:
-        """Return the view that a tab begins with, and the (3,) point that orbits go
-        around."""
+        """Return the first view of a tab, and the (3,) point around which its camera
+        orbits."""
         height = _FIRST_PIXELS
         camera = self.framing.camera(up, max(round(aspect * height), 1), height)
         return replace(View.of_camera(camera), aspect=aspect), self.framing.focus(camera)
 
     @property
     def draws_all_while_moving(self) -> bool:
-        """Whether there are so few gaussians that every picture draws all of them."""
+        """Whether every picture draws all gaussians, because drawing them is fast
+        enough."""
         return self.device.is_cuda or self.num_gaussians <= _FEW_GAUSSIANS
 
     def explain(self, error: Exception) -> str:
-        """Return the line about an error. It contains names of bundles, not their
-        paths, because the tab may belong to another user."""
+        """Return a line of text about an error. It contains the names of bundles but
+        not their paths, because the tab may belong to another user."""
         text = " ".join(str(error).split())
         for path in (bundle.path for bundle in self.scene.bundles):
             if path:
@@ -247,8 +251,8 @@ class SceneView:
 
     @property
     def shows_cuts(self) -> bool:
-        """Whether freezing, splitting and picking are available. A pool on CUDA only
-        draws its own cut."""
+        """Whether freezing, splitting and picking are available. A pool on CUDA can
+        only draw its own cut."""
         return self.pool is None or not self.device.is_cuda
 
     def frame(
@@ -260,18 +264,19 @@ class SceneView:
         steps: _core.BudgetSteps | None = None,
         patience: float = 0.0,
     ) -> Frame:
-        """Draw a picture of ``size`` (width, height) px; with ``steps``, the next one
-        of a sequence.
+        """Draw a picture of ``size`` (width, height) px. ``steps`` is the pacing state
+        of a sequence of pictures; None for a single one.
 
-        It waits up to this many seconds for pages that a pool lacks.
+        Drawing waits up to ``patience`` seconds for missing pages of a pool.
 
         Raises:
-            Stopped: ``stop`` was requested; it is raised soon after.
-            ValueError: The budget is too small for any cut, or a page that a pool lacks
-                is damaged.
+            Stopped: ``stop`` was requested; drawing ends soon after that.
+            ValueError: The budget is too small for any cut, or a page that is needed is
+                damaged.
         """
         _check(stop)
-        if self.pool is not None and self.device.is_cuda:  # the settings of a link may request more
+        # Settings from a link may request a mode that is not available.
+        if self.pool is not None and self.device.is_cuda:
             shows = settings.shows
             if shows not in self.modes:
                 shows = "appearance"
@@ -304,8 +309,8 @@ class SceneView:
     def pick(
         self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings
     ) -> Pick | None:
-        """Return the gaussian with the largest weight in a pixel of a picture, from
-        what is resident if there is a pool."""
+        """Return the gaussian with the largest weight in a pixel of a picture. With a
+        pool, only resident gaussians are considered."""
         camera = view.camera(*size, self.near)
         with self._drawing:
             return pick(
@@ -320,10 +325,10 @@ class SceneView:
             )
 
     def _draw_pool(self, job: _Job, pool: Renderer, patience: float) -> _Drawn:
-        """Draw from a pool, and draw the picture to compare with: the finest cut that
-        fits into the pool.
+        """Draw a picture from a pool and, for a comparison, another one with the finest
+        cut that fits into the pool.
 
-        Both pictures are drawn from the pages of the finer cut.
+        Both are drawn from the pages of the finer cut.
         """
         settings = job.settings
         pool_frame = pool.pool_frame
@@ -367,7 +372,8 @@ class SceneView:
         )
 
     def _draw_resident(self, job: _Job) -> _Drawn:
-        """Draw if all gaussians are resident, and draw all of them for comparison."""
+        """Draw a picture when all gaussians are resident and, for a comparison, another
+        one with all of them."""
         camera = job.camera
         settings = job.settings
         budget = settings.budget
@@ -400,8 +406,8 @@ class SceneView:
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, shows: Shows, stop: _core.Stop | None
     ) -> _Planes:
-        """Draw a window of a cut's picture on the device, or on the CPU if only the CPU
-        supports it."""
+        """Draw a window of the picture of a cut, on the device or, for modes that only
+        the CPU supports, on the CPU."""
         if not self.device.is_cuda or shows in ("count", "error"):
             return self._draw_on_cpu(cut, camera, window, shows, stop)
         image = render(
@@ -426,7 +432,8 @@ class SceneView:
     ) -> _Planes:
         frame = _core.SceneFrame(CPU.number)
         resident = residency.scene(self.scene, CPU)
-        cut.check(resident.revision)  # raises unless the scene still has the instances of the cut
+        # Raises an error if instances of the cut were removed.
+        cut.check(resident.revision)
         residency.set_models(frame, resident.bundles, CPU, _color_by(shows))
         request = _core.FrameRequest(
             camera.core.window(*window),
@@ -442,15 +449,15 @@ class SceneView:
 
 
 def _color_by(shows: Shows) -> ColorBy:
-    """Return the colours that gaussians are drawn with, from which `_paint` computes
-    the other modes."""
+    """Return the colours with which gaussians are drawn. `_paint` computes the other
+    modes from those pictures."""
     if shows in ("level", "cluster", "residency"):
         return shows
     return "appearance"
 
 
 def _look_of(shows: Shows) -> ColorBy | Literal["error", "count"]:
-    """Return the name of a mode in `Look`."""
+    """Return the mode of `v3dg.render.Look` that a display mode is drawn with."""
     if shows in ("error", "count"):
         return shows
     return _color_by(shows)
@@ -485,7 +492,7 @@ def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
 
 
 def _on_background(color: _Float32, alpha: _Float32, settings: Settings) -> _Float32:
-    """Return (H, W, 3) premultiplied colours over the background."""
+    """Return (H, W, 3) the premultiplied colours composited over the background."""
     colors = np.asarray(_device.to_host(color))
     if not any(settings.background):
         return colors
@@ -494,8 +501,8 @@ def _on_background(color: _Float32, alpha: _Float32, settings: Settings) -> _Flo
 
 
 def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
-    """Return the median depth of the covered pixels around the middle; None if there
-    are none."""
+    """Return the median depth of the covered pixels around the middle; None if no pixel
+    there is covered."""
     middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
     covered = depth[middle][alpha[middle] > 0.5]
     if not covered.size:
@@ -504,8 +511,8 @@ def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
 
 
 def _depth_range(alpha: _Float32, depth: _Float32) -> tuple[float, float]:
-    """Return the depths of the nearest and the farthest colour; they are percentiles,
-    so that few distant gaussians have no influence."""
+    """Return the depths of the nearest and the farthest colour. They are percentiles,
+    so that a few distant gaussians have no effect."""
     covered = depth[alpha > 0.5]
     if not covered.size:
         return 0.0, 1.0
@@ -515,12 +522,12 @@ def _depth_range(alpha: _Float32, depth: _Float32) -> tuple[float, float]:
 
 def _check(stop: _core.Stop | None) -> None:
     if stop is not None and stop.is_requested:
-        raise Stopped("it was stopped")
+        raise Stopped("drawing was stopped")
 
 
 def _bounds(scene: Scene) -> tuple[npt.NDArray[np.floating], float]:
-    """Return the centre and radius of a ball around nearly all of the scene: trained
-    assets have a few distant outliers."""
+    """Return the centre and the radius of a ball that contains nearly all of a scene,
+    without the few distant outliers of trained assets."""
     corners: list[Floats] = [np.zeros((0, 3))]
     for number, bundle in enumerate(scene.bundles):
         is_of_bundle = scene.instance_bundle == number

@@ -1,11 +1,10 @@
-"""Decides who may connect to the viewer's server, from the origin that a request
-states.
+"""Decides who may connect to the viewer's server, by the headers of a request.
 
-Any web page can make its visitor's browser connect to this machine. The browser then
-sends the name that it looked up (Host), the page that sends the request (Origin, which
-is absent for pictures, scripts and links of a page) and the relation of that page to
-the server (Sec-Fetch-Site, which browsers omit if the server is another machine and the
-connection is not encrypted). No page can change any of these headers.
+Any web page can make a visitor's browser connect to this machine. The browser sends the
+name of the server (Host), the site of the page (Origin, which is absent for pictures,
+scripts and links), and the relation between the two (Sec-Fetch-Site, which browsers
+omit for unencrypted connections to other machines). A page cannot change any of these
+headers.
 """
 
 import errno
@@ -18,28 +17,29 @@ import socket
 from websockets.http11 import Request
 
 _MOST_PORTS = 1000
-# A name or an address, optionally with a port, as browsers write it: without a user
-# name, in lower case.
+# A name or an address, optionally with a port, in the form that browsers send: lower
+# case and without a user name.
 _HOST = re.compile(
     r"(?:\[(?P<address>[0-9a-f:.]+(?:%[a-z0-9._~-]+)?)\]|(?P<name>[a-z0-9._-]+))(?::[0-9]{0,5})?"
 )
-# Values of Sec-Fetch-Site for the viewer's own page, and for an address that was typed
-# or opened from a bookmark.
+# Values of Sec-Fetch-Site for requests of the viewer's own page, and for addresses that
+# the user typed or opened from a bookmark.
 _OWN_SITES = ("same-origin", "none")
-# Paths of the page, which links of other sites may open.
+# Paths of the page that links on other sites may open.
 _PAGE_PATHS = ("/", "/index.html")
 
 
 class Gate:
-    """Decides which requests to the server at one address of this machine are answered.
+    """Listens at one address of this machine, and decides which requests are answered.
 
     Args:
-        host: Address to listen at; ``"0.0.0.0"`` means all addresses of this machine.
-        port: Port to listen at; if it is taken, the next free one is used.
+        host: Address on which to listen; ``"0.0.0.0"`` means all addresses of this
+            machine.
+        port: Port on which to listen; if it is taken, the next free port is used.
 
     Attributes:
         socket: The socket that listens.
-        port: The port that is used.
+        port: The port on which the socket listens.
         url: The address for a browser. If other machines can connect, it contains a
             secret; requests without the secret are refused.
         is_secret: Whether the address contains a secret.
@@ -53,8 +53,8 @@ class Gate:
         self.port = int(self.socket.getsockname()[1])
         address = ipaddress.ip_address(self.socket.getsockname()[0].partition("%")[0])
         self._names = {"localhost", host.lower(), str(address)}
-        # The names of a machine that listens at all addresses are unknown, so only the
-        # token decides.
+        # A machine that listens on all addresses does not know all its names, so only
+        # the token decides.
         self._has_any_name = address.is_unspecified
         self._token = ""
         if not address.is_loopback:
@@ -70,33 +70,38 @@ class Gate:
             self.url += f"/{self._token}/"
 
     def refusal(self, request: Request) -> str | None:
-        """Return why a request is refused, or None. The token is removed from the path
-        of an accepted request."""
+        """Return the reason why a request is refused; None if it is accepted. The token
+        is removed from the path of an accepted request."""
         headers = request.headers
         texts = (request.path, *(value for _, value in headers.raw_items()))
         if not all(text.isascii() for text in texts):
-            return "The viewer answers requests in ASCII alone.\n"
+            return "The viewer only answers requests in ASCII.\n"
         hosts = [host.lower() for host in headers.get_all("Host")]
         if len(hosts) != 1 or not self._knows(hosts[0]):
-            return "The viewer does not go by this name.\n"
+            return "The viewer does not have this name; open the address that it printed.\n"
         own_origins = (f"http://{hosts[0]}", f"https://{hosts[0]}")
         if any(origin.lower() not in own_origins for origin in headers.get_all("Origin")):
-            return "Other web pages may not use the viewer.\n"
+            return "Other web pages may not connect to the viewer.\n"
         request.path = request.path.partition("?")[0]
         if self._token:
             token, slash, path = request.path.removeprefix("/").partition("/")
             if not slash or not hmac.compare_digest(token.encode(), self._token.encode()):
-                return "Open the whole address that the viewer printed, to the slash at its end.\n"
+                return (
+                    "Open the complete address that the viewer printed, including the slash at "
+                    "its end.\n"
+                )
             request.path = f"/{path}"
         is_own = all(site in _OWN_SITES for site in headers.get_all("Sec-Fetch-Site"))
         if not is_own and not _opens_the_page(request):
-            return "Other web pages may not show what the viewer serves.\n"
+            return "Other web pages may not show the viewer's files.\n"
         return None
 
     def _knows(self, host: str) -> bool:
-        """Return whether a Host is a loopback address or the requested host.
+        """Return whether a Host header is a loopback address or the host on which the
+        viewer listens.
 
-        The owner of any other name could make it point to this machine.
+        Any other name could belong to a hostile site that makes it point to this
+        machine.
         """
         match = _HOST.fullmatch(host)
         if match is None:
@@ -111,8 +116,8 @@ class Gate:
 
 
 def _opens_the_page(request: Request) -> bool:
-    """Return whether a request comes from a tab in which a link to the page was opened;
-    frames have another destination."""
+    """Return whether a request is for opening the page in a tab, from a link on another
+    site. Frames have another Sec-Fetch-Dest."""
     headers = request.headers
     is_navigation = headers.get_all("Sec-Fetch-Mode") == ["navigate"]
     is_tab = headers.get_all("Sec-Fetch-Dest") == ["document"]
@@ -128,6 +133,9 @@ def _listening_socket(host: str, port: int) -> socket.socket:
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise ValueError(
-                    f"host: expected an address of this machine, got {host}"
+                    f"host: expected an address of this machine, got {host}; use 127.0.0.1 or "
+                    "0.0.0.0"
                 ) from error
-    raise ValueError(f"port: expected a free one among {ports[0]} to {ports[-1]}, got none")
+    raise ValueError(
+        f"port: expected a free port from {ports[0]} to {ports[-1]}, got none; choose another port"
+    )

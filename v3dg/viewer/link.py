@@ -1,5 +1,5 @@
-"""The place that a link of the viewer's page leads to, as `page/link_state.js` writes
-it behind the `#` of its address."""
+"""Reads the camera in a link to the viewer's page. `page/link_state.js` writes it
+behind the `#` of the page's address."""
 
 import math
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ from urllib.parse import parse_qsl
 from v3dg._numbers import check
 from v3dg.viewer.view import View
 
-_FOV_BOUNDS = (1.0, 170.0)  # degrees, as in the page
+_FOV_BOUNDS = (1.0, 170.0)  # degrees; the same limits as in the page
 _DEFAULT_FOV = 45.0
 
 
 @dataclass(frozen=True)
 class LinkedPlace:
-    """The camera of a link.
+    """The camera in a link.
 
     Attributes:
-        view: The camera; its aspect is 1, because a link has none.
-        focus: (3,) the point that orbits go around, world units; None if the link has
-            none.
+        view: The viewpoint. Its aspect ratio is 1, because links do not contain it.
+        focus: (3,) the point around which the camera orbits, in world units; None if
+            the link does not contain it.
     """
 
     view: View
@@ -27,11 +27,10 @@ class LinkedPlace:
 
 
 def read_link(link: str) -> LinkedPlace:
-    """Read the camera of a link: the whole address, or what follows its `#`.
+    """Read the camera in a link, which is the whole address or the part after its `#`.
 
     Raises:
-        ValueError: The link has no place, or a value in it is not as the page writes
-            it.
+        ValueError: The link has no camera, or a value in it is invalid.
     """
     values: dict[str, str] = {}
     for name, text in parse_qsl(link.rpartition("#")[2]):
@@ -39,7 +38,9 @@ def read_link(link: str) -> LinkedPlace:
     x, y, z = _numbers(values, "at", 3)
     w, i, j, k = _numbers(values, "turn", 4)
     check(
-        "link", math.hypot(w, i, j, k) > 0.5, "a rotation of length 1 in turn=, got a shorter one"
+        "link",
+        math.hypot(w, i, j, k) > 0.5,
+        ("a quaternion of length 1 in turn=, got a shorter one; copy the whole address"),
     )
     focus = None
     if "focus" in values:
@@ -53,10 +54,10 @@ def read_link(link: str) -> LinkedPlace:
 
 
 def _numbers(values: dict[str, str], name: str, count: int) -> list[float]:
-    """Return the numbers of a value, separated by commas."""
+    """Return the numbers of a value in a link, which are separated by commas."""
     text = values.get(name)
-    expected = "an address that the viewer's page has in its address bar, with"
-    check("link", text is not None, f"{expected} at= and turn= behind #, got none of {name}=")
+    expected = "the address of the viewer's page, with"
+    check("link", text is not None, f"{expected} at= and turn= after #, got one without {name}=")
     try:
         numbers = [float(part) for part in (text or "").replace(",", " ").split()]
     except ValueError:

@@ -1,5 +1,5 @@
-"""Messages from a page to the viewer: JSON of these kinds, with bounded numbers;
-anything else is rejected.
+"""Messages from a page to the viewer: JSON objects of the types below, with bounded
+numbers. Anything else is rejected.
 
 `tests/support/page_protocol.py` generates the page's types from this module and
 `answers`.
@@ -18,11 +18,13 @@ from v3dg.viewer.pacing import Request, scaled
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View
 
-# The longer side of a picture, regardless of the window size that the page claims.
+# Maximum length in px of the longer side of a picture, for any window size that the
+# page sends.
 MOST_PIXELS = 4096
-# The largest message; the page sends dropped files in pieces.
+# Maximum size of a message in bytes. The page sends dropped files in pieces.
 MOST_BYTES = 1 << 20
-# The duration of a path: all its views are made before it can be stopped or saved.
+# Maximum duration of a path in seconds. It is limited because all views are computed
+# before the work can be stopped.
 MOST_PATH_SECONDS = 600.0
 MOST_TOLERANCE = 1e6
 MOST_GAUSSIANS = 1 << 40
@@ -35,7 +37,7 @@ LIMITS = Limits(
     path_seconds=MOST_PATH_SECONDS,
 )
 
-# Bounds also exclude NaN.
+# The bounds also exclude NaN.
 _Number = Annotated[float, msgspec.Meta(ge=-1e15, le=1e15)]
 _Vector = tuple[_Number, _Number, _Number]
 _Quaternion = tuple[_Number, _Number, _Number, _Number]
@@ -91,10 +93,10 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
-    """Requests a picture; replaces the previous request.
+    """Requests a picture. It replaces the previous request.
 
     Attributes:
-        size: Width and height of the picture, px.
+        size: Width and height of the picture in px.
         number: Identifies the pictures that answer this request.
     """
 
@@ -104,17 +106,19 @@ class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
     number: Annotated[int, msgspec.Meta(ge=0, le=1 << 53)] = 0
 
     def request(self) -> Request:
-        """Return the picture to draw, with a size that can be drawn."""
+        """Return the request, with its size limited to `MOST_PIXELS`."""
         size = scaled(self.size, min(1.0, MOST_PIXELS / max(self.size)))
         return Request(self.view.view(), size, self.settings.settings(), self.number)
 
 
 class Pick(msgspec.Struct, tag="pick", forbid_unknown_fields=True):
-    """Asks what is at a point of the picture, or where an instance is.
+    """Asks for the instance at a point of the picture, or for the pose of a given
+    instance.
 
     Attributes:
-        at: The point, as fractions of width and height from the upper left corner.
-        instance: The instance to describe, whatever is at the point.
+        at: The point, as fractions of the width and the height from the upper left
+            corner.
+        instance: The instance to describe; then the point is ignored.
     """
 
     look: Look
@@ -135,13 +139,13 @@ class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True):
 
 
 class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
-    """Requests a file; or the views of a path, to play it.
+    """Requests a file, or the views of a path for playback.
 
     Attributes:
         what: The file: a picture, a film of the path, its cameras, or the scene.
-        look: The content and size.
-        up: The axis that is up, for a scene's file; null for other directions.
-        path: Views, each with the seconds since the one before.
+        look: The content and the size of pictures.
+        up: The axis that points up, for the file of a scene; null for other directions.
+        path: The views of the path, each with the seconds since the previous view.
     """
 
     output: Literal["picture", "film", "cameras", "scene", "play"] = msgspec.field(name="what")
@@ -159,13 +163,13 @@ class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
 
 
 class Crop(msgspec.Struct, tag="crop", forbid_unknown_fields=True):
-    """Asks for a new asset, of the gaussians of a bundle whose centres lie in a box, or
-    of all others.
+    """Requests a new asset with the gaussians of a bundle whose centres are inside a
+    box, or with all others.
 
     Attributes:
-        instance: One that shows the bundle.
-        box: Lower and upper corner, in the bundle's own coordinates.
-        name: Name of the file, whose end is the format.
+        instance: An instance of the bundle.
+        box: Minimum and maximum corner in the coordinates of the bundle.
+        name: Name of the file. Its end selects the format.
     """
 
     instance: Annotated[int, msgspec.Meta(ge=0)]
@@ -182,10 +186,10 @@ class Stop(msgspec.Struct, tag="stop", forbid_unknown_fields=True):
 
 
 class Open(msgspec.Struct, tag="open", forbid_unknown_fields=True):
-    """Announces a file that follows as binary data and is then shown.
+    """Announces a file. Its bytes follow as binary data, and then the file is shown.
 
     Attributes:
-        size: Number of bytes.
+        size: Size of the file in bytes.
     """
 
     name: _Name
@@ -199,4 +203,4 @@ read_message = msgspec.json.Decoder(Message).decode
 def _check_rotation(wxyz: tuple[float, ...]) -> None:
     length = math.hypot(*wxyz)
     if abs(length - 1) > 1e-3:
-        raise ValueError(f"quaternion: expected length 1, got {length:.4g}")
+        raise ValueError(f"quaternion: expected a length of 1, got {length:.4g}")

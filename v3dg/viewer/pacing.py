@@ -1,5 +1,5 @@
-"""Decides how large to draw, and when: small while the camera moves, then step by step
-larger."""
+"""Decides the size and the time of pictures: small ones while the camera moves, then
+larger and larger ones."""
 
 import contextlib
 import math
@@ -16,21 +16,23 @@ from v3dg.viewer.view import View
 
 Size = tuple[int, int]
 
-# The time for one picture while the camera moves; a drag then has an answer in less
-# than twice that.
+# Target time in ms for one picture while the camera moves. A drag is then answered in
+# less than twice this time.
 TARGET_MS = 60.0
-# A larger picture is begun when nothing has changed for this long.
+# A larger picture is started if nothing has changed for this many seconds.
 REST_SECONDS = 0.15
-# A picture at rest waits this long for pages; another one follows while some are
-# missing.
+# While the camera rests, a picture waits this many seconds for missing pages. As long
+# as pages are missing, further pictures follow.
 PAGES_SECONDS = 0.1
-# A draft that has taken this long is abandoned when another picture is requested.
+# A draft that has taken this many seconds is abandoned when another picture is
+# requested.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
-# The size of the smallest draft, as a fraction of the full width; below it the cut gets
-# coarser, by at most this factor of the tolerance.
+# The width of the smallest draft as a fraction of the full width. If that is still too
+# slow, the tolerance is multiplied by up to the second number.
 _SMALLEST = 1 / 4
 _COARSEST = 64.0
-# Sizes are rounded to steps, so that they do not change from picture to picture.
+# Sizes are rounded to this number of steps per factor of two, so that they do not
+# change with every picture.
 _STEPS_AN_OCTAVE = 4
 
 
@@ -38,8 +40,8 @@ class Draft(NamedTuple):
     """The quality of pictures while the camera moves.
 
     Attributes:
-        size: Width and height, px.
-        coarser: Factor of the tolerance.
+        size: Width and height in px.
+        coarser: Factor by which the tolerance is multiplied.
     """
 
     size: Size
@@ -47,12 +49,12 @@ class Draft(NamedTuple):
 
 
 class Pacer:
-    """Chooses the size and tolerance of a draft that meets the target time, from the
-    times of earlier ones.
+    """Chooses the size and the tolerance of a draft so that it meets the target time,
+    based on the times of earlier pictures.
 
-    The model is that time is proportional to work, which is pixels divided by the
-    factor of the tolerance; each picture updates the measured speed. If the model is
-    wrong, the choice still converges to the target time.
+    The model is that time is proportional to work, and work is the number of pixels
+    divided by the factor of the tolerance. Each picture updates the measured speed.
+    Even if the model is inaccurate, the choice converges to the target time.
     """
 
     def __init__(self, target_ms: float = TARGET_MS) -> None:
@@ -60,45 +62,45 @@ class Pacer:
         self._work_per_ms = 0.0
 
     def draft(self, full: Size) -> Draft:
-        """Return how to draw a draft of a picture of size ``full``.
+        """Return the draft for a picture of size ``full``.
 
-        Its aspect is about the same and its size not larger; the first draft has a
-        quarter of the width.
+        The draft has about the same aspect ratio and is not larger. The first draft has
+        a quarter of the width.
         """
         whole = math.prod(full)
         share = (self._target_ms * self._work_per_ms or whole / 16) / whole
-        # The small term prevents rounding from excluding a step that fits.
+        # The small term prevents rounding from excluding a step that fits exactly.
         scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(share) / 2 + 1e-6) / _STEPS_AN_OCTAVE)
         coarser = min(max((_SMALLEST / scale) ** 2, 1.0), _COARSEST)
         return Draft(scaled(full, min(max(scale, _SMALLEST), 1.0)), coarser)
 
     def drew(self, draft: Draft, milliseconds: float) -> None:
-        """Note how long a picture took."""
+        """Update the measured speed with the time of a picture."""
         speed = math.prod(draft.size) / draft.coarser / max(milliseconds, 0.1)
-        # A lower speed counts at once, a higher one only if it persists.
+        # A lower speed is adopted at once, a higher one only gradually.
         share = 1.0
         if speed > self._work_per_ms > 0:
             share = 0.3
         self._work_per_ms += share * (speed - self._work_per_ms)
 
     def rested(self) -> None:
-        """Halve the work of the next draft: on the same CPU the browser is still
-        decoding the large picture."""
+        """Halve the work of the next draft, because the browser on the same CPU is
+        still decoding the large picture."""
         self._work_per_ms /= 2
 
 
 def scaled(full: Size, scale: float) -> Size:
-    """Return a size in px, multiplied by a factor; at least 1 x 1."""
+    """Return a size in px multiplied by a factor; at least 1 x 1."""
     return max(1, round(scale * full[0])), max(1, round(scale * full[1]))
 
 
 def finer_sizes(drawn: Size, full: Size) -> list[Size]:
-    """Return the sizes to draw after ``drawn``, each twice the one before, up to
-    ``full``; empty if that is already drawn."""
+    """Return the sizes to draw after ``drawn``, each twice the previous one, up to
+    ``full``; empty if ``drawn`` is already that large."""
     sizes = []
     width = drawn[0]
     while width < full[0]:
-        # A last step of less than a factor of 1.5 is not worth another picture.
+        # A last step by less than a factor of 1.5 is not worth another picture.
         if 3 * width >= full[0]:
             sizes.append(full)
             break
@@ -108,10 +110,10 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
 
 
 class Request(NamedTuple):
-    """The picture that a tab requests.
+    """A picture that a tab requests.
 
     Attributes:
-        size: Width and height of the full picture, px.
+        size: Width and height of the full picture in px.
         number: Identifies the pictures that answer this request.
     """
 
@@ -122,24 +124,24 @@ class Request(NamedTuple):
 
 
 class SendFrame(Protocol):
-    """Sends a picture to the page; ``is_final`` marks the last picture for the request
-    of that number."""
+    """Sends a picture to the page. ``number`` is that of its request, and ``is_final``
+    marks the last picture for that request."""
 
     def __call__(self, frame: Frame, number: int, *, is_final: bool) -> None: ...
 
 
 class RenderLoop:
-    """Draws the last request of one tab, in its own thread, as often and as large as
-    time allows.
+    """Draws the most recent request of a tab in a separate thread, as often and as
+    large as time allows.
 
-    A request is answered by a small picture; at rest larger ones follow, up to the full
-    size. A new request ends a larger picture at once. It also ends a small picture that
-    has taken too long, after which the next one is smaller; the smallest one is always
-    finished, so that something is shown.
+    A request is answered by a small picture; if no other request arrives, larger ones
+    follow, up to the full size. A new request ends a larger picture at once. It also
+    ends a small picture that has already taken too long, and the next one is smaller.
+    The smallest picture is always finished, so that something is shown.
 
     Args:
-        send: Called with each picture in the loop's thread.
-        fail: Called in the loop's thread with an error of drawing or sending.
+        send: Called in the loop's thread with each picture.
+        fail: Called in the loop's thread with each error of drawing or sending.
     """
 
     def __init__(
@@ -163,7 +165,7 @@ class RenderLoop:
         self._thread.start()
 
     def ask(self, request: Request) -> None:
-        """Request a picture; replaces the previous request."""
+        """Request a picture. It replaces the previous request."""
         with self._changed:
             self._request = request
             if time.monotonic() >= self._patience_ends:
@@ -171,8 +173,8 @@ class RenderLoop:
             self._changed.notify()
 
     def close(self, seconds: float) -> bool:
-        """Draw nothing more; wait at most this long for the thread, and return whether
-        it has ended."""
+        """Stop drawing. Wait at most `seconds` for the thread, and return whether it
+        has ended."""
         with self._changed:
             self._is_closed = True
             self._stop.request()
@@ -193,7 +195,7 @@ class RenderLoop:
             except Stopped:
                 pass
             except Exception as error:
-                # The loop continues, and the tab shows the reason.
+                # The loop continues after an error, and the tab shows the reason.
                 with contextlib.suppress(Exception):
                     self._fail(error)
 
@@ -236,11 +238,11 @@ class RenderLoop:
         try:
             return self._scene_view.frame(view, draft.size, settings, stop, self._steps)
         finally:
-            # A picture that was stopped would have taken at least as long.
+            # A picture that was stopped would have taken at least this long.
             self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
 
     def _draw_until_complete(self, request: Request) -> None:
-        """Draw pictures from a pool until none of its pages is missing."""
+        """Draw pictures from a pool until no page is missing."""
         is_complete = False
         while not is_complete:
             stop = self._begin(0.0)
@@ -254,7 +256,7 @@ class RenderLoop:
 
     def _draw_until_settled(self, request: Request, tolerance: float) -> None:
         """Draw pictures until the tolerance, which approaches that of the budget in
-        steps, is constant."""
+        steps, no longer changes."""
         is_settled = False
         while not is_settled:
             stop = self._begin(0.0)
@@ -266,7 +268,8 @@ class RenderLoop:
             tolerance = frame.figures.tolerance
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
-        """Return the settings without what takes too long while the camera moves."""
+        """Return the settings for pictures while the camera moves, without modes that
+        are too slow."""
         draws_all = self._scene_view.draws_all_while_moving
         if not draws_all and (settings.split > 0 or settings.shows == "difference"):
             settings = replace(settings, shows="appearance", split=0.0)
@@ -279,10 +282,10 @@ class RenderLoop:
         return self._is_closed or self._request is not None
 
     def _begin(self, patience: float) -> _core.Stop:
-        """Return the flag that stops the next picture.
+        """Return the flag that can stop the next picture.
 
-        A new request stops the picture at once if it arrives ``patience`` seconds from
-        now or later.
+        A new request stops the picture only if it arrives at least ``patience`` seconds
+        from now.
         """
         with self._changed:
             self._stop = _core.Stop()

@@ -1,4 +1,4 @@
-"""Camera paths: views at times, and the smooth curve through them."""
+"""Camera paths: views with times, and the smooth curve through these views."""
 
 import itertools
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from v3dg.rotations import normalised
 from v3dg.viewer.view import View
 
 _LEAST_SHARE = 1e-3
-"""Least share of the time between two views; equal views would have none, and the curve
-no slope."""
+"""Minimum share of the time between two views. Without it, equal views would have the
+same time, and the slope of the curve would be undefined."""
 
 
 @dataclass(frozen=True)
@@ -21,19 +21,19 @@ class CameraPath:
     """A path through views.
 
     Attributes:
-        stops: Each view with the seconds since the one before; the seconds of the first
-            are ignored.
+        stops: Each view with the seconds since the previous view; those of the first
+            view are ignored.
     """
 
     stops: Sequence[tuple[float, View]] = ()
 
     @classmethod
     def through(cls, views: Sequence[View], seconds: float) -> "CameraPath":
-        """Return the path through two or more views that lasts this long.
+        """Return the path through at least two views with a duration of ``seconds``.
 
-        Its pace is even: the time between two views is proportional to the sum of the
-        distance and of the angle between them, each as a share of those of the whole
-        path. If no view differs from the one before, the times are equal.
+        The speed is constant: the time between two views is proportional to the sum of
+        their distance and their angle, each as a share of the total along the path. If
+        all views are equal, so are the times.
         """
         rows = _rows(list(views))
         distances = np.linalg.norm(np.diff(rows[:, 4:7], axis=0), axis=1)
@@ -48,21 +48,25 @@ class CameraPath:
 
     @property
     def times(self) -> Floats:
-        """(K,) seconds of each view since the first."""
+        """(K,) time of each view in seconds since the first view."""
         return np.cumsum([0.0, *(seconds for seconds, _ in self.stops[1:])])
 
     def views_at(self, seconds: Floats) -> list[View]:
-        """Return views on a smooth curve through all stops, at times since the first.
+        """Return views on a smooth curve through all stops, at these times since the
+        first stop.
 
         Positions, rotations and fields of view follow cubic Hermite curves with the
         slopes of Catmull-Rom splines for non-uniform times; rotations are normalised.
-        Earlier times give the first view, later ones the last.
+        Times before the first stop give the first view; times after the last stop give
+        the last view.
 
         Raises:
             ValueError: The path is empty.
         """
         check(
-            "path", self.stops, "at least one view, got none; add this one, or record while you fly"
+            "path",
+            self.stops,
+            ("at least one view, got none; add the current view, or record one while you fly"),
         )
         times = self.times
         views = [view for _, view in self.stops]
@@ -84,21 +88,21 @@ class CameraPath:
         return [View(tuple(row[:4]), tuple(row[4:7]), row[7], row[8]) for row in curve.tolist()]
 
     def film(self, fps: int) -> list[View]:
-        """Return the views of a film: the first, the last, and ``fps`` per second in
-        between."""
+        """Return the views of a film: the first and the last one, and ``fps`` views per
+        second in between."""
         seconds = self.times[-1]
         return self.views_at(np.linspace(0.0, seconds, max(round(seconds * fps), 1) + 1))
 
     def cameras(self, fps: int, width: int, height: int, near: float) -> dict[str, Camera]:
-        """Return the cameras of the film's views; their names are numbers of equal
-        length."""
+        """Return the cameras of the film's views. Their names are numbers with equal
+        numbers of digits."""
         views = self.film(fps)
         digits = len(str(len(views) - 1))
         return {f"{i:0{digits}}": view.camera(width, height, near) for i, view in enumerate(views)}
 
 
 def _shares(lengths: Floats) -> Floats:
-    """Lengths as shares of their sum; of a sum of zero, they are zero."""
+    """Return lengths as shares of their sum; zeros if the sum is zero."""
     total = lengths.sum()
     if total == 0:
         return np.zeros_like(lengths)
@@ -107,9 +111,9 @@ def _shares(lengths: Floats) -> Floats:
 
 
 def _rows(views: list[View]) -> Floats:
-    """Return (K, 9): quaternion, position, field of view, aspect.
+    """Return (K, 9): quaternion, position, field of view and aspect ratio of each view.
 
-    The sign of each quaternion is chosen closest to the one before.
+    The sign of each quaternion is chosen so that it is closest to the previous one.
     """
     rows = np.array(
         [(*view.wxyz, *view.position, view.fov_y, view.aspect) for view in views], np.float64

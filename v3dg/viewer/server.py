@@ -1,4 +1,4 @@
-"""The viewer's web server: it serves the page, and connects every browser tab
+"""The viewer's web server. It serves the page, and connects each browser tab
 separately."""
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ if TYPE_CHECKING:
     from v3dg.viewer.answers import Hello
     from v3dg.viewer.tab import Tab
 
-# The end of the server does not wait longer than this for threads.
+# Maximum time in seconds that closing the server waits for threads.
 _CLOSE_SECONDS = 1.0
-# The largest longer side of photographs, by the folder in which the page requests them.
+# Maximum length in px of the longer side of a photograph, by the folder in the page's
+# request.
 _PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
-# Errors of a connection are caused by its client: they are logged, and not printed in
+# Errors of a connection are caused by its client, so they are logged and not printed in
 # the terminal.
 _LOG = logging.getLogger(__name__)
 _LOG.addHandler(logging.NullHandler())
-# Media types of the files that are served; other files in the page's folder are not
-# served.
+# Media types of the files that are served. Files with other suffixes in the page's
+# folder are not served.
 _MEDIA_TYPES = {
     ".html": "text/html",
     ".css": "text/css",
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
 }
-# Headers of every answer, including refusals and errors. No other page can frame this
-# page; it runs only its own files and talks to no other server. Other pages cannot show
-# what is served, nor get access to the window.
+# Headers of every answer, including refusals and errors. Other pages cannot embed this
+# page in a frame, show its files, or access its window. This page runs only its own
+# files and connects to no other server.
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -67,25 +68,26 @@ _HEADERS = {
 
 
 class Site:
-    """The viewer as a web server, from its construction until `close`.
+    """The viewer as a web server, which runs from construction until `close`.
 
     Args:
-        name: Title of the tabs, and name of the files that they save.
-        cameras: Named cameras to jump to.
+        name: Title of the page, and name of the files that it saves.
+        cameras: Cameras by name, to which the user can jump.
         photographs: Files of the cameras' photographs, by the cameras' names.
-        host, port: As for `Gate`.
+        host, port: See `Gate`.
         tolerance, budget, background: Initial settings of a tab.
-        up: (3,) direction in the world that is up.
-        asks_up: Whether ``up`` is only assumed, so that the page asks the user.
-        edits_folder: Folder that pages may write new assets to, never over a file that
-            exists; if None, or if other machines can connect, browsers save them.
+        up: (3,) direction in the world that points up.
+        asks_up: Whether ``up`` is only assumed; then the page asks the user.
+        edits_folder: Folder to which pages may write new assets; existing files are
+            never overwritten. If it is None, or if other machines can connect, the
+            browser saves new assets.
 
     Attributes:
         port, url, is_secret: See `Gate`.
 
     Raises:
-        ImportError: The extra is not installed.
-        TypeError: ``cameras`` is not a mapping of names to cameras.
+        ImportError: The extra `viewer` is not installed.
+        TypeError: ``cameras`` is not a mapping from names to cameras.
         ValueError: See `Gate`.
     """
 
@@ -132,14 +134,14 @@ class Site:
         self._start()
 
     def _allowed_folder(self, folder: Path | None) -> Path | None:
-        """Return the folder that pages may write to; None if other machines can
+        """Return the folder to which pages may write; None if other machines can
         connect."""
         if folder is None or self.is_secret:
             return None
         return Path(folder).absolute()
 
     def _start(self) -> None:
-        """Start the server's thread, and wait until it accepts connections."""
+        """Start the thread of the server, and wait until it accepts connections."""
         self._closing = asyncio.Event()
         is_serving = threading.Event()
         serving = self._serve(is_serving)
@@ -150,9 +152,9 @@ class Site:
         is_serving.wait()
 
     def close(self) -> bool:
-        """End all tabs and the server within about two seconds; return whether all
+        """Close all tabs and the server within about two seconds; return whether all
         their threads have ended."""
-        with contextlib.suppress(RuntimeError):  # the loop is already closed
+        with contextlib.suppress(RuntimeError):  # the event loop may already be closed
             self._loop.call_soon_threadsafe(self._closing.set)
         self._thread.join(3 * _CLOSE_SECONDS)
         return not self._thread.is_alive() and not self._tabs
@@ -172,8 +174,8 @@ class Site:
             logger=_LOG,
             max_size=MOST_BYTES,
             compression=None,  # pictures are already compressed
-            close_timeout=0.5,  # an unresponsive client must not delay the end
-            server_header=None,  # clients need not know versions
+            close_timeout=0.5,  # clients that do not respond must not delay closing
+            server_header=None,  # clients do not need to know versions
             process_request=self._answer,
             process_response=_add_headers,
         )
@@ -183,12 +185,12 @@ class Site:
         await asyncio.to_thread(self._end_tabs)
 
     def _end_tabs(self) -> None:
-        """End the threads of all tabs, including those whose connection is closed."""
+        """End the threads of all tabs, including tabs whose connection is closed."""
         end = time.monotonic() + _CLOSE_SECONDS
         self._tabs = {tab for tab in self._tabs if not tab.close(max(end - time.monotonic(), 0.0))}
 
     async def _talk(self, connection: ServerConnection) -> None:
-        """Serve one tab while it is open."""
+        """Serve a tab until its connection is closed."""
         from v3dg.viewer.answers import encode
         from v3dg.viewer.tab import Tab
 
@@ -196,10 +198,11 @@ class Site:
             coroutine = connection.send(data)
             try:
                 sending = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
-            except RuntimeError:  # the server has ended
+            except RuntimeError:  # the server has been closed
                 coroutine.close()
                 raise
-            # The server's own thread would wait for itself.
+            # Only other threads wait, because the server's own thread would wait for
+            # itself.
             if threading.current_thread() is not self._thread:
                 sending.result()
 
@@ -214,7 +217,7 @@ class Site:
             await connection.send(encode(self._greeting))
             await connection.send(encode(tab.describe_scene()))
             async for data in connection:
-                # An invalid message is ignored, for whatever reason.
+                # Invalid messages are ignored.
                 with contextlib.suppress(Exception):
                     tab.take(data)
         finally:
@@ -223,7 +226,7 @@ class Site:
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the answer to a request for a file of the page; None for a request
-        that opens a connection."""
+        that opens a WebSocket."""
         refusal = self._gate.refusal(request)
         if refusal is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, refusal)
@@ -238,7 +241,7 @@ class Site:
             body = await asyncio.to_thread(self._photograph, place, side)
             media_type = "image/jpeg"
         if body is None:
-            return connection.respond(http.HTTPStatus.NOT_FOUND, "There is no such page.\n")
+            return connection.respond(http.HTTPStatus.NOT_FOUND, "There is no such file.\n")
         response = connection.respond(http.HTTPStatus.OK, "")
         for header in ("Content-Type", "Content-Length"):
             del response.headers[header]
@@ -247,8 +250,8 @@ class Site:
         return response
 
     def _photograph(self, place: str, side: int) -> bytes | None:
-        """Return the photograph of the camera with that number as JPEG; None if there
-        is none, or if it cannot be read."""
+        """Return the photograph of the camera with a number as JPEG; None if there is
+        none, or if it cannot be read."""
         try:
             if not place.isdecimal():
                 return None
@@ -260,7 +263,7 @@ class Site:
                 file = io.BytesIO()
                 picture.convert("RGB").save(file, "jpeg", quality=85)
                 return file.getvalue()
-        except Exception:  # for damaged files, Pillow raises errors of many kinds
+        except Exception:  # Pillow raises errors of many types for damaged files
             return None
 
 
@@ -304,7 +307,7 @@ def _greeting(
 
 
 def _read_page() -> dict[str, bytes]:
-    """Return the files of the page by name."""
+    """Return the content of the page's files, by name."""
     folder = files("v3dg.viewer").joinpath("page")
     return {
         path.name: path.read_bytes()
@@ -314,10 +317,10 @@ def _read_page() -> dict[str, bytes]:
 
 
 def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> None:
-    """Add the headers that all answers have."""
+    """Add the headers that every answer has."""
     response.headers.update(_HEADERS)
 
 
 def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) -> View:
-    """Return the initial view of a tab: that of `v3dg.first_camera`."""
+    """Return the first view of a tab, which is that of `v3dg.first_camera`."""
     return scene_view.first_view(up, aspect)[0]

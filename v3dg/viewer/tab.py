@@ -1,4 +1,5 @@
-"""A browser tab: it does what its page requests, and sends the results to the page."""
+"""The server's part of a browser tab: it executes the requests of a page and sends
+results to it."""
 
 import contextlib
 import copy
@@ -36,17 +37,17 @@ from v3dg.viewer.exports import Exporter, bundle_names
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView
 from v3dg.viewer.pacing import RenderLoop
 
-# Width over height of windows for which first views are framed.
+# Aspect ratios of windows for which first views are computed.
 _HOME_ASPECTS = (0.4, 0.5, 0.6, 0.75, 1.0, 4 / 3, 16 / 9, 2.4)
-# Qualities of JPEG.
+# JPEG qualities of drafts and of final pictures.
 _DRAFT_QUALITY = 75
 _FINAL_QUALITY = 94
-# Pillow's codes for JPEG with colours of half the resolution, and of full resolution.
+# Pillow's codes for chroma subsampling: half the resolution, and full resolution.
 _HALF_COLORS = 2
 _WHOLE_COLORS = 0
 _FPS = 30
-# The least weight in a pixel for a gaussian to be picked by a click; less is hardly
-# visible.
+# Minimum weight of a gaussian in a pixel to be picked by a click. A gaussian with less
+# weight is hardly visible.
 _LEAST_WEIGHT = 0.05
 _SECONDS_BETWEEN_PROGRESS = 0.2
 
@@ -54,16 +55,16 @@ _Send = Callable[[str | bytes], None]
 
 
 class Tab:
-    """The server's half of a page that is connected to a `Site`, until `close`.
+    """The server's part of a page that is connected to a `Site`, until `close`.
 
     Args:
-        scene_view: The scene that is shown until a file is dropped onto the page.
+        scene_view: The scene that is shown, until a file is dropped onto the page.
         name: Name of the files that the page saves.
-        send: Sends text or binary data to the page; waits until they are sent, except
-            in the server's thread.
-        moved: Called with a scene view after one of its instances was moved.
-        edits_folder: Folder that new assets are written to; None has the browser save
-            them, which it also does for a file that was dropped.
+        send: Sends text or binary data to the page. It waits until they are sent,
+            except in the server's thread.
+        moved: Called with the scene view after an instance was moved.
+        edits_folder: Folder to which new assets are written. If it is None, or if the
+            shown file was dropped onto the page, the browser saves them.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class Tab:
         self._missing_bytes = 0
 
     def close(self, seconds: float) -> bool:
-        """Stop drawing and saving; wait at most this long for each thread, and return
+        """Stop drawing and saving. Wait at most `seconds` for each thread, and return
         whether all have ended."""
         has_ended = all([self._loop.close(seconds), self._exporter.close(seconds)])
         if has_ended and self._folder is not None:
@@ -98,15 +99,15 @@ class Tab:
         return has_ended
 
     def ask_again(self) -> None:
-        """Draw again, because the subject has changed."""
+        """Draw again after the subject has changed."""
         if self._look is not None:
             self._loop.ask(self._look.request())
 
     def take(self, data: str | bytes) -> None:
-        """Execute a message of the page.
+        """Execute a message from the page.
 
         Raises:
-            ValueError: The message is not one of `messages`.
+            ValueError: The message is invalid.
         """
         if isinstance(data, bytes):
             self._take_bytes(data)
@@ -130,7 +131,7 @@ class Tab:
                 self._begin_file(message)
 
     def describe_scene(self) -> answers.Scene:
-        """Return what the page needs to know about the subject."""
+        """Return the description of the subject that the page needs."""
         scene_view = self.scene_view
         bundles = scene_view.scene.bundles
         num_missing = np.arange(4)
@@ -208,8 +209,8 @@ class Tab:
         self._moved(self.scene_view)
 
     def _begin_picking(self, message: messages.Pick) -> None:
-        """Answer in a separate thread, unless an earlier question is still
-        unanswered."""
+        """Answer in a separate thread. If an earlier request is still unanswered, this
+        one is ignored."""
         if self._picking.acquire(blocking=False):
             threading.Thread(
                 target=self._pick, args=(message,), name="v3dg pick", daemon=True
@@ -225,7 +226,7 @@ class Tab:
             self._picking.release()
 
     def _find(self, message: messages.Pick) -> answers.Picked:
-        """Return the instance that a page asks about, or that is at a point of its
+        """Return the instance that the page has named, or the one at a point of its
         picture."""
         if message.instance is not None:
             return self._describe_instance(message.instance)
@@ -282,7 +283,7 @@ class Tab:
     def _save_film(self, message: messages.Save, stop: _core.Stop) -> None:
         request = message.look.request()
         views = message.camera_path().film(_FPS)
-        # H.264 needs an even width and height.
+        # H.264 requires an even width and height.
         width = max(request.size[0] // 2 * 2, 2)
         height = max(request.size[1] // 2 * 2, 2)
         steps = _core.BudgetSteps()
@@ -309,8 +310,7 @@ class Tab:
         self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
 
     def _save_scene(self, message: messages.Save) -> None:
-        """Save the current instances, the axis that is up, and the cameras of the
-        path."""
+        """Save the current instances, the up axis, and the cameras of the path."""
         width, height = message.look.request().size
         path = message.camera_path()
         cameras: dict[str, Camera] = {}
@@ -332,13 +332,17 @@ class Tab:
         name = message.name
         counts = f"{len(part):,} of {len(whole):,} gaussians"
         if not len(part):
-            raise ValueError(f"box: nothing is left of {len(whole):,} gaussians; change the box")
+            raise ValueError(f"box: nothing remains of {len(whole):,} gaussians; change the box")
         if self._edits_folder is None:
             self._exporter.save(name, lambda file: write_asset(file, part))
-            self._tell(answers.Notice(f"{name} has {counts}."))
+            self._tell(answers.Notice(f"{name} contains {counts}."))
             return
         write_new_asset(self._edits_folder, name, part)
-        self._tell(answers.Notice(f"{name} was written beside what is shown: {counts}."))
+        self._tell(
+            answers.Notice(
+                f"{name} was written beside the file that is shown; it contains {counts}."
+            )
+        )
 
     def _checked_instance(self, number: int) -> int:
         count = len(self.scene_view.scene)
@@ -348,7 +352,7 @@ class Tab:
 
     def _begin_file(self, message: messages.Open) -> None:
         """Create the file for the binary data that follows, in a folder that is removed
-        with the tab."""
+        together with the tab."""
         self._folder = self._folder or tempfile.TemporaryDirectory(prefix="v3dg_")
         if self._dropped is not None:
             self._dropped.close()
@@ -359,7 +363,7 @@ class Tab:
     def _take_bytes(self, data: bytes) -> None:
         file = self._dropped
         if file is None:
-            raise ValueError("file: bytes came before the name; send `open` first")
+            raise ValueError("file: data arrived before its name; send `open` first")
         file.write(data[: self._missing_bytes])
         self._missing_bytes -= min(len(data), self._missing_bytes)
         if self._missing_bytes == 0:
@@ -374,7 +378,8 @@ class Tab:
                 subject = Bundle.open(path)
             else:
                 subject = read_asset(path)
-        except (OSError, ValueError) as error:  # no page may learn the folders of this machine
+        # Pages must not learn the names of folders on this machine.
+        except (OSError, ValueError) as error:
             raise ValueError(str(error).replace(f"{path.parent}{os.sep}", "")) from None
         scene_view = SceneView(subject, device=self.scene_view.device)
         old_loop = self._loop
@@ -396,7 +401,8 @@ def _colors(colors: npt.NDArray[np.float32]) -> list[answers.Color]:
 
 
 def _resident_bytes(statm_path: str = "/proc/self/statm") -> int:
-    """Return the memory of this process; without /proc, its maximum so far."""
+    """Return the memory of this process in bytes; without /proc, return the maximum so
+    far."""
     try:
         with open(statm_path, encoding="ascii") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

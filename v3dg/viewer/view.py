@@ -1,5 +1,5 @@
-"""Views: cameras in the terms of a browser, and the pinhole cameras that follow from
-them."""
+"""Views: viewpoints without a size in pixels, as browsers use them, and the pinhole
+cameras for pictures of them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,14 +12,14 @@ from v3dg.rotations import in_range, quaternion_from_rotation, rotation_from_qua
 
 @dataclass(frozen=True)
 class View:
-    """A camera without a size in pixels.
+    """A viewpoint: a camera without a size in pixels.
 
     Attributes:
-        wxyz: Rotation from camera (x right, y down, z forward) to world, a quaternion
-            of any nonzero length.
-        position: Position of the eye, world units.
+        wxyz: Rotation from camera (x right, y down, z forward) to world as a
+            quaternion, which need not be normalised.
+        position: Position of the camera in world units.
         fov_y: Vertical field of view in radians.
-        aspect: Width over height.
+        aspect: Width divided by height.
     """
 
     wxyz: tuple[float, float, float, float]
@@ -29,7 +29,7 @@ class View:
 
     @classmethod
     def of_camera(cls, camera: Camera) -> "View":
-        """Return the view with a camera's pose and field of view; the position of the
+        """Return the view with the pose and the field of view of a camera. The
         principal point is ignored."""
         half_x = camera.width / 2 / camera.fx
         half_y = camera.height / 2 / camera.fy
@@ -37,8 +37,8 @@ class View:
         return cls(wxyz, tuple(camera.position.tolist()), 2 * math.atan(half_y), half_x / half_y)
 
     def camera(self, width: int, height: int, near: float) -> Camera:
-        """Return the camera whose picture of ``width`` x ``height`` px fills the view;
-        its pixels need not be square."""
+        """Return the camera for a picture of ``width`` x ``height`` px that fills the
+        view. Its pixels need not be square."""
         quaternion = in_range(np.asarray(self.wxyz, np.float64))
         rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
         viewmat = rigid(rotation, np.asarray(self.position, np.float64))
@@ -52,6 +52,7 @@ class View:
 def look_at(
     eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float
 ) -> View:
-    """Return the view from ``eye`` with ``target`` in the middle and ``up`` upwards."""
+    """Return the view from ``eye`` that has ``target`` in the middle and ``up``
+    upwards."""
     of_camera = View.of_camera(Camera.look_at(eye, target, up, width=1, height=1))
     return replace(of_camera, fov_y=fov_y, aspect=aspect)

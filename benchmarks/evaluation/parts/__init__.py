@@ -1,10 +1,10 @@
 """The parts of the evaluation, one module each.
 
-A part has a TITLE, a sentence or two ABOUT its question, and three functions.
-run(evaluation) measures and returns JSON values, or yields them again whenever there
-are more. tables(result) returns them as Markdown. summary(result) says in a sentence or
-two where we win and where we do not. If there is something to plot, plot(result,
-figure) draws it.
+A part has two texts, TITLE and ABOUT, which state its question, and three functions.
+`run(evaluation)` measures, and returns JSON values or yields them repeatedly as they
+grow. `tables(result)` returns the values as Markdown tables. `summary(result)` returns
+sentences about where v3dg is better and where it is not. A part may also have
+`plot(result, figure)`, which draws a plot.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ NAMES = (
     "views",
     "levels",
 )
-"""The parts in order of importance, in which they are run."""
+"""The parts in the order in which they run, the most important first."""
 
 
 def part(name: str) -> Any:
     """Return the module of a part.
 
     Raises:
-        ValueError: The part does not exist.
+        ValueError: There is no part of this name.
     """
     if name not in NAMES:
         raise ValueError(f"parts: expected some of {', '.join(NAMES)}, got {name}")

@@ -1,5 +1,5 @@
-"""Rasterizer, split, selection and build alone: time, fraction of the machine's limit,
-growth with size."""
+"""Rasterizer, split, selection and build, each measured alone: time, fraction of the
+hardware's limit, and growth with the number of gaussians."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def copy_bandwidth(device: str) -> float:
-    """Return the bytes per second, read and written, of one large copy."""
+    """Return the bandwidth of one large copy: bytes read plus bytes written, per
+    second."""
     source = np.ones(_COPIED_BYTES, np.uint8)
     if device == "cpu":
         target = np.empty_like(source)
@@ -87,7 +88,8 @@ def rasterize_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
         row |= gsplat_peer(evaluation, gaussians, camera, picture.color)
     elif evaluation.device == "cpu":
         row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
-    renderer = Renderer(gaussians, device=evaluation.device)  # converts the asset once
+    # Converts the asset to the renderer's layout, once.
+    renderer = Renderer(gaussians, device=evaluation.device)
     timed = time_ms(
         lambda: renderer.render(camera).stats, evaluation.device, evaluation.settings.repeats
     )
@@ -118,7 +120,8 @@ def _checked_psnr(expected: Any, color: Any) -> float:
     found = psnr(*(to_8bit(c).astype(np.float32) / 255 for c in (expected, color)))
     if not found >= _LEAST_PSNR:
         raise RuntimeError(
-            f"picture: expected at least {_LEAST_PSNR:g} dB to the reference, got {found:.1f}"
+            f"picture: expected a PSNR of at least {_LEAST_PSNR:g} dB against the reference, got "
+            f"{found:.1f} dB"
         )
     return round(min(found, 99.0), 2)
 
@@ -148,7 +151,7 @@ def split_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
                 _device.to_host(order), _core.median_split(means, ends, depth)[0]
             ):
                 raise RuntimeError(
-                    "median_split: expected the same order on both devices, got another"
+                    "median_split: expected the same order on both devices, got different ones"
                 )
     timed = time_ms(
         lambda: _core.median_split(on_device, ends, depth),
@@ -161,8 +164,8 @@ def split_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
 
 
 def select_row(evaluation: Evaluation, count: int) -> Row:
-    """Return the row for a scene of this many gaussians, at a distance where about half
-    are coarse."""
+    """Return the row of a scene with this many gaussians. The distance is such that
+    about half of the gaussians are drawn from coarser levels."""
     bundle = evaluation.build().bundle
     instances = max(1, count // len(evaluation.asset))
     rng = np.random.default_rng(evaluation.seed)
@@ -206,9 +209,9 @@ def build_row(evaluation: Evaluation, count: int) -> Row:
     }
 
 
-# One process per number of threads is needed, because OpenMP reads the number once. The
-# script prints milliseconds of a split and of a frame. It uses the module path of this
-# process, because the working folder may contain another v3dg.
+# Each number of threads needs a separate process, because OpenMP reads the number only
+# once. The script prints the milliseconds of a split and of a frame. It uses the module
+# path of this process, because the working directory may contain another v3dg.
 _SCRIPT = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])

@@ -1,5 +1,5 @@
-"""Comparison with clipping: omitting what is small on screen, as gsplat's `radius_clip`
-does, at equal counts."""
+"""Comparison with clipping at equal counts. Clipping omits gaussians that are small on
+screen, like gsplat's `radius_clip`."""
 
 from __future__ import annotations
 
@@ -74,8 +74,11 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def clipped(evaluation: Evaluation, view: View, count: int) -> tuple[float, int, Picture]:
-    """Return the clip that leaves at most this many of the full scene's gaussians in
-    the picture, and the picture."""
+    """Clip the full scene to at most this many gaussians in the picture.
+
+    Returns:
+        The clip radius in px, the number of gaussians, and the picture.
+    """
     everything = select(evaluation.full_scene, view.camera, tolerance=0.0, device="cpu").gaussians(
         device=evaluation.device
     )

@@ -1,5 +1,5 @@
-"""Composed scenes (figures 6 and 7): the full assets against our cut, from near to
-far."""
+"""Composed scenes (figures 6 and 7 of the paper): the full assets against cuts of their
+levels, from near to far."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ABOUT = (
 
 
 def run(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
-    """Yield the results after each scene."""
+    """Yield the results so far after each scene."""
     scenes: list[Row] = []
     for name, scene, views in evaluation.composed_scenes():
         rows, pictures = measure(evaluation, scene, views)
@@ -70,7 +70,7 @@ def measure(evaluation: Evaluation, scene: Scene, views: list[View]) -> tuple[li
 def strips(
     rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]], side: int
 ) -> Picture:
-    """Near, middle and far pictures: truth, full, ours."""
+    """Return pictures from near, middle and far: reference, full assets, and cut."""
     middle = sorted({rows[index]["elevation"] for index, *_ in judged})
     wanted = middle[len(middle) // 2]
     line = sorted(
@@ -101,7 +101,7 @@ _NAMES = ("in_frustum", "ms", "least_ms", "flip", "psnr")
 
 
 def by_distance(scene: Row) -> list[Row]:
-    """Return means over directions and elevations."""
+    """Return means over directions and elevations for each distance."""
     groups: dict[float, list[Row]] = {}
     for row in scene["views"]:
         least = {f"{who}_least_ms": row[f"{who}_ms_range"][0] for who in ("full", "ours")}
@@ -150,7 +150,8 @@ _OVERVIEW_COLUMNS = (
 
 
 def overview(result: dict[str, Any]) -> str:
-    """Return a row per scene: its mean over the distances, and its farthest view."""
+    """Return a table with two rows per scene: the mean over the distances, and the
+    farthest view."""
     table = []
     for scene in result["scenes"]:
         rows = by_distance(scene)
@@ -183,7 +184,7 @@ def summary(result: dict[str, Any]) -> Summary:
                 f"{blurred['ours_flip']:.4f} against {blurred['full_flip']:.4f} without levels "
                 f"({blurred['ours_ms']:.2f} ms against {blurred['full_ms']:.2f})"
             )
-        # The fastest frames are compared, because other work on the machine disturbs
+        # The fastest frames are compared, because other work on the machine affects
         # them least.
         slower = [row for row in rows if row["ours_least_ms"] > 1.02 * row["full_least_ms"]]
         if slower:

@@ -1,5 +1,5 @@
-"""Local splatting (table 1, upper half): the benefit of fitting the levels, by number
-of steps."""
+"""Local splatting (table 1 of the paper, upper half): how much the fit of the levels
+improves them, by number of steps."""
 
 from __future__ import annotations
 

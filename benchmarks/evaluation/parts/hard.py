@@ -1,5 +1,5 @@
-"""Hard cases for level of detail: hair-thin lines, a sky of huge soft gaussians, a
-dense tree."""
+"""Assets that are hard for level of detail: hair-thin lines, a sky of huge soft
+gaussians, and a dense tree."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ABOUT = (
 _SHARES = (0.5, 0.25, 0.1)
 _FAR = 4.0
 _LEAST_PX = 32
-_SUPERSAMPLING = 8  # hair is far thinner than half a pixel
+_SUPERSAMPLING = 8  # samples per side of a pixel; hair is far thinner than half a pixel
 _NOTICED_FLIP = 1e-3
 
 
@@ -55,8 +55,8 @@ def cameras_around(evaluation: Evaluation, asset: Gaussians) -> dict[str, Camera
     direction = np.array([0.2, -0.8, 0.55])
 
     def camera(factor: float) -> Camera:
-        # The view has as many px² per gaussian as at the larger distance, without the
-        # empty rest of the picture.
+        # This camera has as many px² per gaussian as the camera at the larger distance,
+        # without the empty part of its picture.
         side = max(_LEAST_PX, round(evaluation.settings.panel / factor))
         eye = center + factor * distance * direction
         return Camera.look_at(
@@ -107,8 +107,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
                 if share in (None, _SHARES[-1]) or ours_count > wanted:
                     text = f"{ours_count / count:.0%}"
                     strip += [(f"ours, {text}", ours), (f"merged, {text}", theirs)]
-                # This is the coarsest cut: the eye is inside the balls of the remaining
-                # groups.
+                # The cut is already the coarsest one: the eye is inside the balls of
+                # the remaining groups.
                 if ours_count > wanted:
                     break
             strip[0] = f"{name}, {where}: truth", truth
@@ -124,8 +124,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def enlarged(picture: Picture, side: int) -> Picture:
-    """Return the picture with each pixel as a square, so that its size is approximately
-    this."""
+    """Return the picture with every pixel repeated to a square, so that the picture has
+    about `side` px per side."""
     factor = max(1, side // picture.shape[0])
     return picture.repeat(factor, 0).repeat(factor, 1)
 

@@ -1,5 +1,5 @@
-"""Comparison with a hierarchy of single gaussians (H3DG; table 2 and figure 9), at
-equal numbers of gaussians."""
+"""Comparison with a hierarchy of single gaussians (H3DG; table 2 and figure 9 of the
+paper) at equal numbers of gaussians."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""One large asset (figure 12), over the distances: no instances, one tree."""
+"""One large asset in a single tree, without instances (figure 12 of the paper), at
+several distances."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Levels side by side (figure 10): every level of the asset, for several numbers of
-steps of the fit."""
+"""Levels side by side (figure 10 of the paper): every level of the asset, for several
+numbers of steps of the fit."""
 
 from __future__ import annotations
 

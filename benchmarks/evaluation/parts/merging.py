@@ -1,16 +1,16 @@
-"""Comparison with levels that are only merged: pairs by their moments, and the output
-of other tools for the same asset.
+"""Comparison with levels of the same asset that are only merged, not fitted: pairs
+merged by their moments, and the output of other tools.
 
-Other tools run beforehand, on the asset of the evaluation; their output is read from
-the folder of peers, as <asset>_<tool>_<percent>.ply:
+The other tools run beforehand on the asset of the evaluation. Their output is read from
+the folder of peers, from files named <asset>_<tool>_<percent>.ply:
 
     splat-transform -g cpu -w donut.ply -d 50% peers/donut_splat-transform_50.ply
-    splat-transform -g cpu -w donut.ply --decimate-adaptive 50%
-    peers/donut_adaptive_50.ply node benchmarks/studies/spark_levels.mjs donut.ply peers
-    50 25 12.5 6.25 1
+    splat-transform -g cpu -w donut.ply --decimate-adaptive 50% \\
+        peers/donut_adaptive_50.ply
+    node benchmarks/studies/spark_levels.mjs donut.ply peers 50 25 12.5 6.25 1
 
-The file seconds.json in that folder has the time of each, {"splat-transform": {"50":
-1.0}}.
+The file seconds.json in that folder has the duration of each run, such as
+{"splat-transform": {"50": 1.0}}.
 """
 
 from __future__ import annotations
@@ -70,7 +70,10 @@ def peer_rows(evaluation: Evaluation) -> list[Row]:
     for path in sorted(evaluation.peers.glob(f"{evaluation.asset_name}_*.ply")):
         found = re.fullmatch(rf"{re.escape(evaluation.asset_name)}_(.+)_([0-9.]+)", path.stem)
         if found is None:
-            raise ValueError(f"{path}: expected a name like {evaluation.asset_name}_TOOL_50.ply")
+            raise ValueError(
+                f"{path}: expected a name like {evaluation.asset_name}_TOOL_50.ply; rename the "
+                "file or move it out of the folder"
+            )
         tool, percent = found.groups()
         theirs = read_asset(path)
         footprint = footprint_of_cut(bundle, len(theirs))
@@ -88,13 +91,13 @@ def peer_rows(evaluation: Evaluation) -> list[Row]:
 
 
 def view_camera(bundle: Bundle, view: int, footprint_px2: float | None) -> Camera:
-    """Return a camera around the asset: with the large picture, or one in which the
-    asset's ball covers this many px²."""
+    """Return a camera around the asset. Its picture has the large size or, if a
+    footprint is given, the size at which the asset's ball covers that many px²."""
     means = bundle.level_gaussians(0).means
     center = (means.min(axis=0) + means.max(axis=0)).astype(np.float64) / 2
     radius = float(np.linalg.norm(means - center, axis=1).max())
-    # Directions form a spiral on the sphere between 50 degrees below and above the
-    # horizon.
+    # Directions form a spiral on the sphere, from 50 degrees below the horizon to 50
+    # degrees above.
     z = 0.77 * (2 * (view + 0.5) / _VIEWS - 1)
     angle = math.pi * (3 - math.sqrt(5)) * view
     side = math.sqrt(1 - z * z)
@@ -111,8 +114,8 @@ def view_camera(bundle: Bundle, view: int, footprint_px2: float | None) -> Camer
 
 
 def footprint_of_cut(bundle: Bundle, count: int) -> float:
-    """Return the footprint of the asset's ball at which the default cut has this many
-    gaussians, averaged over views."""
+    """Return the footprint in px² of the asset's ball at which the default cut has
+    `count` gaussians on average over the views."""
     scene = Scene.of(bundle)
     low, high = 1.0, 64.0 * count
     for _ in range(24):
@@ -131,8 +134,8 @@ def footprint_of_cut(bundle: Bundle, count: int) -> float:
 def compare(
     evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: float | None
 ) -> Row:
-    """Return means over the views of FLIP and PSNR, for all gaussians, theirs, and our
-    cut with at most as many."""
+    """Return FLIP and PSNR, averaged over the views, of three pictures: all gaussians,
+    `theirs`, and our cut with at most as many gaussians as `theirs`."""
     scene = Scene.of(bundle)
     coarser = bundle.level_range(1)[0] if bundle.num_levels > 1 else 0
     own_filter = (
@@ -148,8 +151,8 @@ def compare(
             bundle, camera, tolerance=tolerance_for(scene, camera, len(theirs)), device="cpu"
         )
         counts.append(ours.stats.gaussians_selected)
-        # Their levels are drawn like the asset, or with our filter if that suits them
-        # better.
+        # The level of the other tool is drawn without a filter, like the asset, and
+        # with our filter; the better picture counts.
         drawn = [
             to_8bit(rasterize(theirs, camera, filter_px2=px2, antialiased=compensated).color)
             for px2, compensated in ((0.0, False), own_filter)

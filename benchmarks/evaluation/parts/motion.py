@@ -1,5 +1,5 @@
-"""Steadiness: a zoom through the scene, and how much more consecutive frames differ
-than necessary."""
+"""Steadiness: a zoom through the scene, and the changes between consecutive frames
+beyond those of the reference."""
 
 from __future__ import annotations
 

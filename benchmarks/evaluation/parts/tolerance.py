@@ -1,5 +1,5 @@
-"""Tolerances (table 1, lower half): milliseconds against FLIP, the paper's levels and
-ours on one curve."""
+"""Tolerances (table 1 of the paper, lower half): milliseconds against FLIP, for levels
+with the paper's settings and with ours."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def gsplat_row(evaluation: Evaluation) -> Row:
-    """Return the row of gsplat, which draws every gaussian of the scene, already in the
-    world."""
+    """Return the row of gsplat, which draws every gaussian of the scene from world
+    space."""
     import torch
 
     every_one = select(

@@ -1,5 +1,5 @@
-"""Tree or DAG (table 3): gaussians per cluster and clusters per group, always with
-8,192 gaussians per group."""
+"""Tree or DAG (table 3 of the paper): gaussians per cluster and clusters per group,
+with 8,192 gaussians per group in all cases."""
 
 from __future__ import annotations
 

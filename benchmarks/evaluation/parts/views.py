@@ -1,5 +1,5 @@
-"""Original views (table 5): the close views that an asset was trained for; nothing may
-be lost in them."""
+"""Original views (table 5 of the paper): close views, for which the asset was trained
+and in which levels must lose nothing."""
 
 from __future__ import annotations
 
@@ -113,5 +113,5 @@ def summary(result: dict[str, Any]) -> Summary:
 
 
 def _drop(row: Row) -> float:
-    """Return the PSNR lost against the full asset, dB."""
+    """Return the PSNR that the cut loses against the full asset, in dB."""
     return float(row["full_psnr"] - row["ours_psnr"])

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.studies.fades`; measure.py says what it does."""
+"""The command `python -m benchmarks.studies.fades`, which runs measure.py."""
 
 import sys
 

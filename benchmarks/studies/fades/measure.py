@@ -1,10 +1,10 @@
 """Does a fade between levels remove pops? Bundles on slow paths, in comparison with the
-hard cut and all gaussians.
+hard cut and with all gaussians.
 
-The hard cut is drawn twice: at the same tolerance, and at the lower one at which it has
-as many gaussians as the fade. A constant cut is also drawn, that of the middle of the
-path: its flicker is not popping, and no fade can be steadier. docs/fades.md discusses
-the result.
+The hard cut is drawn twice: at the tolerance of the fade, and at a lower tolerance at
+which it has as many gaussians as the fade. A constant cut, selected in the middle of
+the path, is drawn in all frames as well. Its flicker is not popping, and no fade can be
+steadier. docs/fades.md discusses the results.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from v3dg.cleaning import ball_of_most
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _HALVINGS = 24
-_FILLS = 2.0  # distance of the nearest camera, in radii of the ball of most gaussians
-_SPACING = 2.5  # between copies in a field, in the same radii
+# Distance of the nearest camera, in radii of the ball around most gaussians.
+_FILLS = 2.0
+_SPACING = 2.5  # distance between copies in a field, in the same radii
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -35,25 +36,45 @@ def main(arguments: list[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "bundles", nargs="+", type=Path, help=".v3dg files, each as PATH or PATH:UP (-y, z)"
+        "bundles",
+        nargs="+",
+        type=Path,
+        help=(".v3dg files, each as PATH or PATH:UP, where UP is an axis such as -y or z"),
     )
-    parser.add_argument("--frames", type=int, default=60, help="of each path")
-    parser.add_argument("--side", type=int, default=1, help="of a field of copies; 1: a single one")
-    parser.add_argument("--size", type=int, default=160, help="sides of the pictures, px")
+    parser.add_argument("--frames", type=int, default=60, help="number of frames of each path")
     parser.add_argument(
-        "--distances", type=float, nargs="+", default=[1.0, 2.0], help="where paths begin"
+        "--side",
+        type=int,
+        default=1,
+        help=("number of copies per side of a square field; 1 for a single copy"),
+    )
+    parser.add_argument(
+        "--size", type=int, default=160, help=("width and height of the pictures in px")
+    )
+    parser.add_argument(
+        "--distances",
+        type=float,
+        nargs="+",
+        default=[1.0, 2.0],
+        help=("distances from which paths begin, relative to the nearest one"),
     )
     parser.add_argument("--fades", type=float, nargs="+", default=[DEFAULT_FADE])
     parser.add_argument("--tolerance", type=float, default=DEFAULT_TOLERANCE)
-    parser.add_argument("--paths", nargs="+", help="only these")
+    parser.add_argument("--paths", nargs="+", help="names of the paths to measure; by default all")
     parser.add_argument(
-        "--samples", type=int, default=SUPERSAMPLING, help="of the true pictures, a side"
+        "--samples",
+        type=int,
+        default=SUPERSAMPLING,
+        help=("samples per side of a pixel of the reference pictures"),
     )
     parser.add_argument(
-        "--level-0-filter", type=float, default=0.0, help="px2, with compensated opacities"
+        "--level-0-filter",
+        type=float,
+        default=0.0,
+        help=("variance in px2 of a filter with compensated opacities for level 0"),
     )
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--json", type=Path, help="write the result there")
+    parser.add_argument("--json", type=Path, help="JSON file for the results")
     options = parser.parse_args(arguments)
 
     rows = []
@@ -83,8 +104,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def filtered(bundle: Bundle, filter_px2: float) -> Bundle:
-    """Return the bundle with a filter and compensated opacities at level 0, as coarser
-    levels have."""
+    """Return the bundle with a filter and compensated opacities at level 0, which
+    coarser levels already have."""
     if filter_px2 == 0.0:
         return bundle
     clusters = bundle.clusters
@@ -98,8 +119,9 @@ def filtered(bundle: Bundle, filter_px2: float) -> Bundle:
 
 
 def field_of(bundle: Bundle, side: int, up: str) -> Scene:
-    """Return a square field of copies of the bundle, each rotated about its vertical
-    axis at random; one is not rotated."""
+    """Return a square field of copies of the bundle. Each copy is rotated about its
+    vertical axis by a random angle; the only copy of a field of side 1 is not
+    rotated."""
     if side == 1:
         return Scene.of(bundle)
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
@@ -116,14 +138,14 @@ def field_of(bundle: Bundle, side: int, up: str) -> Scene:
 
 
 def axes(up: str) -> tuple[Any, Any]:
-    """Return the vertical axis, and one perpendicular to it."""
+    """Return the vertical axis, and an axis perpendicular to it."""
     axis = np.array(_AXES[up[-1]]) * (-1 if up[0] == "-" else 1)
     return axis, np.roll(axis, 1)
 
 
 def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[Camera, Any]:
-    """Return a camera at the distance where the bundle fills a picture, or a multiple
-    of it; and the bundle's middle."""
+    """Return a camera and the centre of the bundle. `distance` is relative to the
+    distance at which the bundle fills a picture."""
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
     axis, aside = axes(up)
     direction = math.cos(0.45) * aside + math.sin(0.45) * axis
@@ -132,8 +154,8 @@ def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[C
 
 
 class Stays:
-    """The hard cut of one camera for all frames, drawn as a fade is drawn: with a
-    filter at level 0."""
+    """The hard cut of one camera, drawn in all frames. It has weights like a fade, so
+    that level 0 is drawn with a filter as in a fade."""
 
     def __init__(self, camera: Camera, tolerance: float) -> None:
         self.camera, self.tolerance = camera, tolerance
@@ -149,8 +171,12 @@ class Stays:
 def measure(
     scene: Scene, path: CameraPath, options: Any, of: Row, *, along_motion: bool = True
 ) -> list[Row]:
-    """Return the rows of one path: all gaussians, the hard cut, fades, the hard cut
-    with as many gaussians, and the constant cut."""
+    """Measure one path.
+
+    Returns:
+        The rows of all gaussians, the hard cut, each fade, the hard cut with as many
+        gaussians as the first fade, and the constant cut.
+    """
     tolerance = options.tolerance
     cuts: dict[str, Cut] = {"all": {"tolerance": 0.0}, "hard": {"tolerance": tolerance}}
     cuts |= {f"fade {fade:g}": {"tolerance": tolerance, "fade": fade} for fade in options.fades}
@@ -172,8 +198,8 @@ def _mean_count(scene: Scene, cameras: list[Camera], **how: Any) -> float:
 
 
 def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most: float) -> float:
-    """Return the least tolerance, up to one, at which the hard cut has at most this
-    many gaussians per frame."""
+    """Return the smallest tolerance, at most `most`, at which the hard cut has at most
+    `count` gaussians per frame."""
     low, high = most / 4, most
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
@@ -185,10 +211,11 @@ def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most:
 
 
 def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "distance")) -> Row:
-    """Return the result of a fade for each start: ratios of the worst values to those
-    of the hard cut and of all gaussians.
+    """Return the result of a fade for each start: its worst values relative to those of
+    the hard cut and of all gaussians.
 
-    Starts differ in the keys. The worst value is that of drifts, if there are any.
+    A start is a combination of values of `keys`. The worst value is taken over drifts,
+    if there are any, else over all paths.
     """
     starts = sorted({tuple(row[key] for key in keys) for row in rows})
     found = []
@@ -231,7 +258,7 @@ def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "dis
 
 
 def line(row: Row) -> str:
-    """Return a row as one line."""
+    """Return a row as a line of text."""
     start = f"{row['asset']:>10} {row['distance']:4g} " if "distance" in row else ""
     warped = (
         f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  "

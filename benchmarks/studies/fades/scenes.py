@@ -1,17 +1,18 @@
-"""Does a fade remove pops in scenes? Thousands of instances, crowds of captured assets,
-rooms from inside.
+"""Does a fade remove pops in scenes? Scenes are thousands of instances, crowds of
+captured assets, and rooms seen from inside.
 
-A picture is divided into windows of some pixels. Each window drifts towards and away
-from the object in its own middle, so slowly that nothing else hides a pop. All windows
-together form the picture. The cuts are those of `fades`.
-docs/notes/experiments/2026-11-23-fades-scenes-unfiltered.md discusses the result.
+A picture is divided into windows. The camera of each window drifts towards and away
+from the object in the middle of the window, so slowly that no other motion hides a pop.
+The cuts are the same as in `fades`.
+docs/notes/experiments/2026-11-23-fades-scenes-unfiltered.md discusses the results.
 
-A subject is one of
+A subject has one of these forms:
 
-    SCENE.json@CAMERA@CAMERA a scene file, or a published layout, seen by cameras of its
-    own BUNDLE.v3dg+CAMERAS.json@CAMERA a bundle, seen by cameras of a file
-    BUNDLE.v3dg:UP,BUNDLE.v3dg:UP a crowd of these, as large as each other; from within
-    and above
+- SCENE.json@CAMERA@CAMERA is a scene file or a published layout, seen by some of its
+  own cameras.
+- BUNDLE.v3dg+CAMERAS.json@CAMERA is a bundle, seen by cameras of another file.
+- BUNDLE.v3dg:UP,BUNDLE.v3dg:UP is a crowd of bundles that are scaled to one size, seen
+  from within and from above.
 """
 
 from __future__ import annotations
@@ -43,32 +44,34 @@ from v3dg import (
 from v3dg._device import to_host
 from v3dg.cleaning import ball_of_most
 
-_PITCH = 2.2  # between members of a crowd, in radii of the ball of most gaussians
+# Distance between members of a crowd, in radii of the ball around most gaussians.
+_PITCH = 2.2
 _COVERED, _SEEN = (
     0.9,
     0.25,
-)  # alpha from which on a pixel shows an object, and the least fraction of such pixels
+)  # minimum alpha of a pixel that shows an object, and minimum fraction of such pixels
 
 
 @dataclass
 class Config:
     subjects: tyro.conf.Positional[tuple[str, ...]]
-    """See the module's docstring."""
+    """What to draw; the docstring of the module describes the forms."""
     frames: int = 24
     picture: tuple[int, int] = (1920, 1080)
     window: tuple[int, int] = (320, 180)
     windows: int = 0
-    """Windows per camera, evenly spaced among those that tile the picture and show an
-    object; 0: all."""
+    """Number of windows per camera, evenly spaced among the windows that show an
+    object; 0 for all of them."""
     side: int = 10
-    """Number of members per side of a crowd."""
+    """Number of members per side of a square crowd."""
     fades: tuple[float, ...] = (DEFAULT_FADE,)
     tolerance: float = DEFAULT_TOLERANCE
     paths: tuple[str, ...] = ("drift in", "drift out")
     samples: int = SUPERSAMPLING
-    """Samples per side of a pixel of the true pictures."""
+    """Samples per side of a pixel of the reference pictures."""
     level_0_filter: float = 0.0
-    """px², with compensated opacities."""
+    """Variance in px² of a filter with compensated opacities for level 0; 0 for
+    none."""
     device: str = "cpu"
     json: Path | None = None
 
@@ -81,7 +84,7 @@ class Subject:
 
 
 def subject_of(text: str, config: Config) -> Subject:
-    """Return the subject that a name in the command means."""
+    """Return the subject that an argument of the command describes."""
     files, *names = text.split("@")
     path, _, camera_file = files.partition("+")
     if ".v3dg:" in files:
@@ -95,7 +98,7 @@ def subject_of(text: str, config: Config) -> Subject:
 
 
 def with_filter(scene: Scene, filter_px2: float) -> Scene:
-    """Return the scene with a filter at level 0."""
+    """Return the scene with a filter at level 0 of all bundles."""
     changed = Scene()
     for b, bundle in enumerate(scene.bundles):
         mine = scene.instance_bundle == b
@@ -105,8 +108,8 @@ def with_filter(scene: Scene, filter_px2: float) -> Scene:
 
 
 def crowd_of(members: list[str], side: int) -> Subject:
-    """Return a square crowd of assets, scaled to one size and turned upright, each
-    equally often."""
+    """Return a square crowd of assets, scaled to one size and rotated upright. All
+    assets occur equally often."""
     random = np.random.default_rng(0)
     who = np.resize(np.arange(len(members)), side * side)
     random.shuffle(who)
@@ -140,7 +143,7 @@ def crowd_of(members: list[str], side: int) -> Subject:
 
 
 def _upright(up: str) -> Any:
-    """Return the (3, 3) rotation from the asset's vertical axis to z."""
+    """Return the (3, 3) rotation that maps the asset's vertical axis to z."""
     axis, aside = axes(up)
     return np.stack([aside, np.cross(axis, aside), axis])
 
@@ -151,7 +154,8 @@ def _about_z(angle: float) -> Any:
 
 
 def _quaternion(turn: Any) -> Any:
-    """Return (4,) w x y z of a rotation: the eigenvector of the largest eigenvalue."""
+    """Return the quaternion (w, x, y, z) of a (3, 3) rotation: the eigenvector of the
+    largest eigenvalue of a symmetric matrix."""
     (a, b, c), (d, e, f), (g, h, i) = turn
     rows = [
         [a + e + i, h - f, c - g, d - b],
@@ -163,8 +167,8 @@ def _quaternion(turn: Any) -> Any:
 
 
 def windows_of(scene: Scene, camera: Camera, config: Config) -> Iterator[tuple[str, Camera, Any]]:
-    """Yield parts of a camera's picture, and the object of each: names, cameras, and
-    positions in the world."""
+    """Yield windows of a camera's picture: the name, the camera, and the position in
+    world space of the object in the middle."""
     camera = resized(camera, config.picture)
     width, height = config.window
     image = render(scene, resized(camera, (480, 270)), depth=True, device=config.device)
@@ -210,11 +214,11 @@ def main(config: Config) -> None:
                         rows += found
                         print(f"{subject.name} {camera_name} {window}, {of['away']} away")
                         print(*map(line, found), sep="\n", flush=True)
-                report(rows, config)  # so that an interrupted run leaves its results
+                report(rows, config)  # writes the results of an interrupted run, too
 
 
 def report(rows: list[Row], config: Config) -> None:
-    """Write the results so far."""
+    """Write all rows that have been measured."""
     settings = {k: v for k, v in vars(config).items() if k not in ("subjects", "json", "device")}
     verdicts = [verdict(rows, fade, ("asset", "camera")) for fade in config.fades]
     write(config.json, {**settings, "rows": rows, "verdict": verdicts}, config.device)

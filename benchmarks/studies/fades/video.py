@@ -1,11 +1,12 @@
-"""The visibility of pops in a slow drift: ColorVideoVDP of the hard cut and of a fade,
-compared with all gaussians.
+"""The visibility of pops during a slow drift: ColorVideoVDP of the hard cut and of a
+fade.
 
 Frames at 30 per second, as on a screen of 1920 x 1080 px, are compared with two
-references: frames of all gaussians with 4 x 4 samples, from which a cut differs
-everywhere and always; and the same path drawn from the cut of its middle frame, from
-which it differs only by changes of levels while the camera moves. Needs the package
-`cvvdp`, and a GPU for large pictures; docs/fades.md discusses the result.
+references. The reference "truth" has all gaussians with 4 x 4 samples per pixel, so a
+cut differs from it everywhere and in all frames. The reference "frozen" draws the same
+path with the cut of its middle frame, so a cut differs from it only by changes of
+levels while the camera moves. The study needs the package `cvvdp`, and a GPU for large
+pictures. docs/fades.md discusses the results.
 """
 
 from __future__ import annotations
@@ -38,12 +39,18 @@ def main(arguments: list[str] | None = None) -> int:
         "--bundle", type=Path, required=True, help=".v3dg file of the layout's asset"
     )
     parser.add_argument(
-        "--layout", type=Path, required=True, help="scene file of instances and cameras"
+        "--layout", type=Path, required=True, help="scene file with instances and cameras"
     )
-    parser.add_argument("--cameras", nargs="+", help="names of those from which paths begin")
-    parser.add_argument("--frames", type=int, default=60, help="of each path")
     parser.add_argument(
-        "--size", type=int, nargs=2, default=[1920, 1080], help="of the pictures, px"
+        "--cameras", nargs="+", help=("names of the layout's cameras from which paths begin")
+    )
+    parser.add_argument("--frames", type=int, default=60, help="number of frames of each path")
+    parser.add_argument(
+        "--size",
+        type=int,
+        nargs=2,
+        default=[1920, 1080],
+        help=("width and height of the pictures in px"),
     )
     parser.add_argument(
         "--references", nargs="+", default=["truth", "frozen"], choices=["truth", "frozen"]
@@ -51,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", default="cuda", choices=["cpu", "cuda"])
     parser.add_argument("--tolerances", type=float, nargs="+", default=[3.0, 9.4])
     parser.add_argument("--paths", nargs="+", default=["drift in", "drift out"])
-    parser.add_argument("--json", type=Path, help="write the result there")
+    parser.add_argument("--json", type=Path, help="JSON file for the results")
     options = parser.parse_args(arguments)
 
     asset = json.loads(options.layout.read_text(encoding="utf-8"))["asset"]
@@ -76,8 +83,12 @@ def main(arguments: list[str] | None = None) -> int:
 def measure(
     scene: Scene, cameras: list[Camera], options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Return the rows of one path: just-objectionable differences, 10 if there are
-    none, and gaussians per frame."""
+    """Measure one path.
+
+    Returns:
+        Rows with ColorVideoVDP's quality in JOD (just-objectionable differences; 10
+        means no visible difference) and gaussians per frame.
+    """
     import pycvvdp
 
     metric = pycvvdp.cvvdp(display_name=_DISPLAY, device=torch.device(options.device), quiet=True)
@@ -92,7 +103,9 @@ def measure(
             middle = cameras[len(cameras) // 2]
             cut = select(scene, middle, tolerance=tolerance, cull=False, device=options.device)
         for fade in [None, DEFAULT_FADE] if tolerance > 0 else [None]:
-            if cut is not None:  # drawn in the same way, so that only pops differ
+            # The reference is drawn like the frames, with or without weights, so that
+            # only pops differ.
+            if cut is not None:
                 weights = None if fade is None else np.ones(len(cut), np.float32)
                 still = replace(cut, given_weights=weights)
                 references["frozen"] = video(renderer, cameras, 1, cut=still)[0]
@@ -110,8 +123,11 @@ def measure(
 
 
 def video(renderer: Renderer, cameras: list[Camera], samples: int, **cut: Any) -> tuple[Any, float]:
-    """Return (F, H, W, 3) bytes of the frames, each pixel the mean of samples x
-    samples; and gaussians per frame."""
+    """Draw frames whose pixels are means of `samples` x `samples` samples.
+
+    Returns:
+        (F, H, W, 3) bytes, and the mean number of gaussians per frame.
+    """
     frames, gaussians = [], 0
     for camera in cameras:
         image = renderer.render(camera.scaled(samples), **cut)

@@ -1,4 +1,6 @@
-"""Levels at equal counts and several sizes, in comparison with those of other tools.
+"""Errors of levels at equal numbers of gaussians and at several picture sizes, in
+comparison with levels of other tools.
 
-`measure` records errors of assets (`subject`), `report` makes a page from them.
+`measure` records the errors for assets, which `subject` defines. `report` makes a page
+from the records.
 """

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.studies.pairs`; measure.py says what it does."""
+"""The command `python -m benchmarks.studies.pairs`."""
 
 from benchmarks.studies.pairs.measure import main
 

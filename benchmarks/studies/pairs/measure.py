@@ -1,40 +1,47 @@
-"""Levels at equal counts and several sizes: ours, merging alone, and levels of other
-tools and of the assets' authors.
+"""Errors of levels at equal numbers of gaussians and at several picture sizes: our
+levels, merging alone, levels of other tools, and levels by the authors of the assets.
 
-    python -m benchmarks.studies.pairs measure ASSETS -o pairs --device cuda python -m
-    benchmarks.studies.pairs report pairs/pairs.json -o docs/notes/pairs.md --plots
-    docs/images
+    python -m benchmarks.studies.pairs measure ASSETS -o pairs --device cuda
+    python -m benchmarks.studies.pairs report pairs/pairs.json \\
+        -o docs/notes/pairs.md --plots docs/images
 
-ASSETS is a folder with assets.json. For each asset it has, by name: a `file` that v3dg
-reads; `up` for an object, which is drawn from four sides; or for a scene `cameras`, a
-transforms.json, `views`, names of some of them, and `refined_from`, a file of other
-cameras for its refinement; and `published`, by name the `file` and number of
-`gaussians` of its authors' levels. Levels of other tools are
-ASSETS/peers/NAME/TOOL_PERCENT.npz, which `subject.pack_level` makes from the output of
+ASSETS is a folder with assets.json, which maps the names of assets to objects with
+these fields:
+
+- `file` is an asset that v3dg reads.
+- `up` is the vertical axis of an object, which is drawn from four sides.
+- `cameras` is the transforms.json of a scene, and `views` are names of the cameras that
+  are measured. `refined_from` is a file with other cameras, from which the scene is
+  refined.
+- `published` maps names to levels by the asset's authors, each with a `file` and its
+  number of `gaussians`.
+
+Levels of other tools are ASSETS/peers/NAME/TOOL_PERCENT, in any format that v3dg reads,
+or packed by `subject.pack_level` into .npz files. They are made by commands such as
 
     splat-transform -g cpu -w NAME.ply -d 50% d_50.ply
     splat-transform -g cpu -w NAME.ply --decimate-adaptive 50% adaptive_50.ply
 
-or from any format that v3dg reads.
+A pair is a number of gaussians and a picture size. A level has its native size if there
+are 2 px² for each of its gaussians. For an object, the px² are those of the footprint
+of its ball; for a scene, those of the picture, multiplied by the fraction of the
+asset's gaussians that are in the picture. Every level is drawn at `factors` times the
+native length of a side. The methods "ours" and "merged" are the finest cuts with at
+most as many gaussians as the other level, drawn with the filter that the bundle
+requires. With `--refine`, "refined" is measured in the same way. Levels of other tools
+are drawn completely and without a filter.
 
-A pair is a count and a size. A level has its native size at 2 px² for each of its
-gaussians: px² of the footprint of an object's ball, or of a scene's picture multiplied
-by the share of the asset's gaussians that are in it. Every level is drawn at `factors`
-times that size, measured along a side. "Ours" and "merging alone" are the finest cuts
-with at most as many gaussians as the other level, drawn with the filter that the bundle
-requires; with `--refine`, so is "refined". Other levels are drawn completely and
-without a filter.
+For a scene, only gaussians whose means are in the picture count, separately for each
+picture. Levels of other tools distribute their gaussians unevenly, so each of these
+levels forms a separate pair. Cuts consist of whole groups. If a cut has fewer than 97 %
+of the allowed gaussians, its error and the error of the next finer cut are interpolated
+in the logarithm of the number of gaussians. If the eye is inside the balls of groups,
+these groups are refined at any tolerance; a smaller number of gaussians is then reached
+with the smallest sufficient `min_level`.
 
-For a scene, only gaussians whose means are in the picture count, separately in each
-picture: others' levels distribute their gaussians unevenly, so each of these levels
-forms its own pair. Cuts consist of whole groups. If a cut has fewer than 97 % of the
-count, its error and that of the next finer cut are interpolated in the logarithm of the
-count. If the eye is inside of groups, these are refined at any tolerance; a smaller
-count is then met with the least `min_level` that suffices.
-
-The true picture has every gaussian at four by four samples per pixel. For a picture
-wider than `widest`, a window is compared, around a gaussian drawn at random with a
-preference for large and opaque ones.
+The reference picture has every gaussian at 4 x 4 samples per pixel. If a picture is
+wider than `widest`, only a window is compared. The window is around a gaussian that is
+drawn at random, with a preference for large and opaque gaussians.
 """
 
 from __future__ import annotations
@@ -66,21 +73,22 @@ Row = dict[str, Any]
 PERCENTS = (50.0, 25.0, 12.5, 6.25, 3.0, 1.5, 0.7)
 _OURS = ("ours", "refined", "merged")
 _SAMPLES = 4
-_FULL_ENOUGH = 0.97  # fraction of a budget
+_FULL_ENOUGH = 0.97  # minimum fraction of a budget that a single cut must use
 _FINEST_PX2, _COARSEST_PX2 = 1e-9, 1e30
-_STEP = 2 ** (-1.5 / 2048)  # cuts whose tolerances are closer count as neighbours
-_LEAST_PX = 8  # px per side: SSIM needs 6, and smaller pictures show nothing
+# Cuts whose tolerances differ by a smaller factor count as neighbours.
+_STEP = 2 ** (-1.5 / 2048)
+_LEAST_PX = 8  # minimum px per side; SSIM needs 6, and smaller pictures show nothing
 
 
 @dataclass
 class Measure:
-    """Build, draw and compare; writes OUTPUT/pairs.json."""
+    """Build, draw and compare levels; write OUTPUT/pairs.json."""
 
     assets: tyro.conf.Positional[Path]
     """Folder with assets.json."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("pairs")
     only: tuple[str, ...] = ()
-    """Names of assets; all by default."""
+    """Names of the assets to measure; by default all."""
     methods: tuple[Literal["all", "ours", "refined", "merged", "peers"], ...] = (
         "all",
         "ours",
@@ -90,25 +98,27 @@ class Measure:
     )
     """Methods to measure; "all" draws every gaussian with one sample per pixel."""
     known: tuple[Path, ...] = ()
-    """Recorded results, from which rows are taken that are not measured here."""
+    """Files with recorded results, whose rows are kept if their methods are not
+    measured now."""
     percents: tuple[float, ...] = PERCENTS
-    """Counts of gaussians, in percent of the asset's count."""
+    """Numbers of gaussians, in percent of the asset's."""
     factors: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-    """Picture sizes, relative to the native size of each level."""
+    """Lengths of picture sides, as multiples of each level's native length."""
     widest: int = 512
-    """px of a side of the pictures that are compared."""
+    """Maximum width and height in px of the compared pictures."""
     views: int = 4
     device: Literal["auto", "cpu", "cuda"] = "auto"
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
-    """Settings of our levels; "merged" has the same settings, without fitting steps."""
+    """Settings of the builds; "merged" uses the same settings with no steps of the
+    fit."""
     refine: int = 0
-    """Refinement steps of the method "refined"; with 0 steps it is left out."""
+    """Steps of the refinement for the method "refined"; 0 skips this method."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The subject of a picture: all gaussians, or a cut of a bundle; and the weight of
-    the picture in the error of its method."""
+    """What a picture shows: all gaussians or a cut of a bundle, and the weight of the
+    picture in the mean error of its method."""
 
     method: str
     subject: v3dg.Gaussians | v3dg.Bundle
@@ -119,32 +129,33 @@ class Shown:
 
 @dataclass(frozen=True)
 class Level:
-    """Gaussians that represent an asset, and their origin."""
+    """The gaussians of a level, and the method that made them."""
 
     method: str
     gaussians: v3dg.Gaussians
     counts: list[int]
-    """Number of gaussians that count, in each view."""
+    """For each view, the number of gaussians that count."""
 
 
 def errors(item: tuple[Row, Picture, Picture]) -> Row:
-    """Return FLIP, PSNR and SSIM of (description, truth, picture)."""
+    """Return FLIP, PSNR and SSIM of a (description, reference, picture)."""
     return errors_of(item[1], item[2])
 
 
 @dataclass(frozen=True)
 class Target:
-    """A count that our cuts have to meet, and others' levels with that count."""
+    """A number of gaussians for our cuts, and the levels of other tools with that
+    number."""
 
     label: float | str
     count: int
     counts: list[int]
-    """Number of gaussians that count, in each view."""
+    """For each view, the number of gaussians that count."""
     levels: list[Level]
 
 
 class Study:
-    """The measured pairs and methods."""
+    """Measures the methods and pairs that the settings request."""
 
     def __init__(self, config: Measure) -> None:
         self._config = config
@@ -152,7 +163,8 @@ class Study:
         self.builds: dict[str, Row] = {}
 
     def rows(self, subject: Subject, judges: Judges) -> list[Row]:
-        """Return means over the views of each method, count and size."""
+        """Return the mean over the views for each method, number of gaussians and
+        size."""
         views: dict[tuple[Any, ...], list[Row]] = {}
         for (about, _, _), found in judges.measured(self._drawn(subject), errors):
             key = tuple(
@@ -163,7 +175,7 @@ class Study:
         return [dict(zip(names, key, strict=True)) | weighted(rows) for key, rows in views.items()]
 
     def _drawn(self, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
-        """Yield the comparisons: description, truth, picture."""
+        """Yield the pictures to compare: description, reference and picture."""
         wanted_of_ours = set[str](self._config.methods) - (
             {"refined"} if self._config.refine == 0 else set()
         )
@@ -182,8 +194,9 @@ class Study:
                 yield from self._compared(subject, target, factor, bundles, sizes)
 
     def _targets(self, subject: Subject) -> list[Target]:
-        """Return the targets: for objects each percentage; for a scene each other
-        level, because their counts in a picture differ."""
+        """Return a target per percentage for an object. A scene has a target per level
+        of another tool, because the levels have different numbers of gaussians in a
+        picture."""
         targets: dict[float | str, Target] = {}
         for percent in self._config.percents:
             counts = [round(count * percent / 100) for count in self._asset.counts]
@@ -214,7 +227,8 @@ class Study:
         return gaussians.torch("cuda") if self.device == "cuda" else gaussians
 
     def _built(self, subject: Subject, name: str, ours: v3dg.Bundle | None) -> v3dg.Bundle:
-        """Return the bundle to refine: `ours`, or one that is built for it."""
+        """Build the bundle of a method. The method "refined" refines `ours` if it was
+        built, else a new bundle."""
         config = replace(self._config.build, steps=0) if name == "merged" else self._config.build
         start = time.perf_counter()
         if name == "refined" and ours is not None:
@@ -271,8 +285,8 @@ class Study:
 
 
 def cluster_sizes(bundle: v3dg.Bundle, camera: v3dg.Camera | None = None) -> Any:
-    """Return (C,) the gaussians of each cluster; with a camera, only those whose means
-    are in its picture."""
+    """Return (C,) the number of gaussians of each cluster; with a camera, only
+    gaussians whose means are in its picture count."""
     offset = bundle.clusters.offset
     if camera is None:
         return np.diff(offset)
@@ -283,10 +297,11 @@ def cluster_sizes(bundle: v3dg.Bundle, camera: v3dg.Camera | None = None) -> Any
 def cuts_of(
     name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, sizes: Any = None
 ) -> list[Shown]:
-    """Return the finest cut with at most this many gaussians, and the next finer one if
-    it has far fewer.
+    """Return the finest cut with at most `count` gaussians, and the next finer cut if
+    the first one has far fewer.
 
-    `sizes`: number of gaussians of each cluster that count; by default all.
+    `sizes` is the number of gaussians of each cluster that count; by default all
+    gaussians count.
     """
     scene = v3dg.Scene.of(bundle)
     sizes = cluster_sizes(bundle) if sizes is None else sizes
@@ -324,12 +339,13 @@ def cuts_of(
 
 
 def weighted(rows: list[Row]) -> Row:
-    """Return weighted means of the measurements."""
+    """Return the weighted means of the rows' measurements."""
     means: Row = {}
     for name in ("gaussians", "tolerance", "flip", "psnr", "ssim"):
         known = [row for row in rows if row[name] is not None]
         values, weights = [row[name] for row in known], [row["weight"] for row in known]
-        if name == "gaussians":  # errors are interpolated in its logarithm
+        # Errors are interpolated in the logarithm of the number.
+        if name == "gaussians":
             means[name] = round(
                 math.exp(np.average(np.log(np.maximum(values, 1)), weights=weights))
             )
@@ -374,8 +390,11 @@ def by_key(rows: list[Row]) -> dict[tuple[Any, ...], Row]:
 def known_results(
     paths: tuple[Path, ...], settings: Row, changes: Row
 ) -> tuple[dict[tuple[Any, ...], Row], dict[str, Row], Row]:
-    """Return rows and builds of recorded results, which must have the same settings,
-    and all changes."""
+    """Read recorded results, which must have the same settings.
+
+    Returns:
+        The rows, the records of builds, and the changed build settings.
+    """
     rows: dict[tuple[Any, ...], Row] = {}
     builds: dict[str, Row] = {}
     for path in paths:
@@ -393,7 +412,7 @@ def known_results(
 
 
 def main() -> None:
-    """Read the command line of both parts, and run one."""
+    """Run the command "measure" or "report" of the command line."""
     commands: dict[str, Callable[..., Measure | pairs_report.Report]]
     commands = {"measure": Measure, "report": pairs_report.Report}
     options = tyro.extras.subcommand_cli_from_dict(commands)

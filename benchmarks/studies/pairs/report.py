@@ -1,5 +1,5 @@
-"""The page of `pairs`: tables of our error relative to the best other tool's at equal
-counts, and plots."""
+"""The page of `pairs`: tables of our errors relative to the best other tool at equal
+numbers of gaussians, and plots."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ gaussians in a picture.
 
 @dataclass
 class Report:
-    """Make a page with tables, and plots, of what `measure` has recorded."""
+    """Make a page with tables and plots from the results of `measure`."""
 
     results: tyro.conf.Positional[Path]
-    """A pairs.json."""
+    """A file pairs.json."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("pairs.md")
     plots: Path | None = None
-    """Folder for the plots; without it there are none."""
+    """Folder for the plots; by default none are drawn."""
 
 
 def best_others(rows: Sequence[Row], which: str = "ours") -> list[Row]:
-    """Return one row for each pair of a count and a size that others have, too: ours,
-    and the best other."""
+    """Return a row for each pair that other tools have, too, with our error and the
+    smallest error of another tool."""
     pairs: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         pairs.setdefault((row["asset"], row["level"], row["factor"]), {})[row["method"]] = row
@@ -95,8 +95,11 @@ def _ratio(ours: float, theirs: float) -> float:
 
 
 def overview(rows: Sequence[Row], which: str = "ours") -> str:
-    """Return a line for each asset, and for all assets: one in total, one from half the
-    size on, and one for each size."""
+    """Return a table with a line for each asset.
+
+    With several assets, further lines combine all assets: all pairs, pairs from half
+    the native size on, and the pairs of each size.
+    """
     pairs = best_others(rows, which)
     names = list(dict.fromkeys(row["asset"] for row in pairs))
     lines = [_line(name, [row for row in pairs if row["asset"] == name]) for name in names]
@@ -151,8 +154,8 @@ def _level(row: Row) -> str:
 
 
 def table(pairs: Sequence[Row]) -> str:
-    """Return the table of one asset: counts down, sizes across, FLIP of ours and of the
-    best other, and their ratio."""
+    """Return the table of one asset. Numbers of gaussians are rows and sizes are
+    columns; cells have our FLIP, the best other tool's FLIP, and the ratio."""
     factors = sorted({row["factor"] for row in pairs})
     lines: dict[Any, Row] = {}
     for row in sorted(pairs, key=lambda row: -row["count"]):
@@ -172,8 +175,8 @@ def table(pairs: Sequence[Row]) -> str:
 
 
 def rows_of(recorded: Row) -> list[Row]:
-    """Return the rows of a result, which stores them as dicts, or as lists with
-    separate names of columns."""
+    """Return the rows of a result. They are stored as dicts, or as lists with the names
+    of the columns in "columns"."""
     columns = recorded.get("columns")
     if columns is None:
         return list(recorded["rows"])
@@ -212,8 +215,8 @@ def report(options: Report) -> None:
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
-    """Plot count against FLIP, and PSNR below, for each size: three sizes side by side,
-    as wide as a page."""
+    """Plot FLIP, and PSNR below it, against the number of gaussians, for each size.
+    Three sizes are side by side, so that the plot fits a page."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -260,8 +263,8 @@ def plot(rows: Sequence[Row], path: Path) -> None:
 
 
 def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
-    """Plot one curve per method from rows of one picture size, at the counts of
-    gaussians at which another tool has a level."""
+    """Plot one curve per method from rows of one picture size. Only numbers of
+    gaussians at which another tool has a level are plotted."""
     counts = {
         row["level"]: row["gaussians"] for row in rows if row["method"] not in (*_OURS, "all")
     }

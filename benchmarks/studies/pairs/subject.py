@@ -1,5 +1,5 @@
-"""The subjects of `pairs`: assets with their views and sizes, and others' levels of
-them."""
+"""The subjects of `pairs`: assets with their views and sizes, and levels of these
+assets by other tools."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ import numpy as np
 import v3dg
 
 HOME_PX2 = 2.0
-_BALL_SHARE = 0.995  # fraction of the gaussians; the others may be far away
-_DISTANCE = 2.5  # of the camera from an object's centre, in radii
+# Fraction of gaussians in the ball; the remaining ones may be far away.
+_BALL_SHARE = 0.995
+_DISTANCE = 2.5  # of the camera from the centre of an object, in radii
 
 
 @dataclass(frozen=True)
 class Size:
-    """The size of a view: the camera of the whole picture, and of the compared part."""
+    """A view at one size: the camera of the whole picture, and the camera of the
+    compared window."""
 
     camera: v3dg.Camera
     window: v3dg.Camera
 
 
 class Subject:
-    """An asset with its views and sizes."""
+    """An asset of assets.json, with its views and sizes."""
 
     def __init__(self, folder: Path, name: str, about: dict[str, Any], views: int) -> None:
         self.name, self._folder, self._about = name, folder, about
@@ -41,7 +43,7 @@ class Subject:
         return [cameras[name] for name in self._about.get("views", list(cameras))[:views]]
 
     def _object_views(self, views: int) -> list[v3dg.Camera]:
-        """Return cameras with square pictures around the ball of nearly all
+        """Return cameras with square pictures around the ball that contains nearly all
         gaussians."""
         means = self.asset.means.astype(np.float64)
         center = np.quantile(means, [0.01, 0.99], axis=0).mean(axis=0)
@@ -57,13 +59,13 @@ class Subject:
 
     @property
     def refined_from(self) -> list[v3dg.Camera]:
-        """Return the cameras for refining a scene; none for an object, which is refined
-        from all around."""
+        """Return the cameras from which a scene is refined. For an object the list is
+        empty, and the refinement uses directions all around."""
         name = self._about.get("refined_from")
         return [] if name is None else list(v3dg.read_cameras(self._folder / name).values())
 
     def counts(self, gaussians: v3dg.Gaussians) -> list[int]:
-        """Return the number of gaussians that count, in each view: all for an object,
+        """Return for each view the number of gaussians that count: all for an object;
         those in the picture for a scene."""
         if not self.is_scene:
             return [len(gaussians)] * len(self.cameras)
@@ -71,12 +73,13 @@ class Subject:
 
     @cached_property
     def _share_seen(self) -> float:
-        """Return the mean fraction of the asset's gaussians in the pictures."""
+        """Return the fraction of the asset's gaussians that are in a picture, averaged
+        over the pictures."""
         return float(np.mean(self.counts(self.asset))) / len(self.asset)
 
     def sizes(self, count: int, factor: float, widest: int) -> list[Size]:
-        """Return each view, at a multiple of the native size of a level with this many
-        gaussians."""
+        """Return the sizes of all views, at `factor` times the native length of a side
+        of a level with `count` gaussians."""
         if self.is_scene:
             wanted = HOME_PX2 * count * self._share_seen
             scales = [math.sqrt(wanted / (c.width * c.height)) for c in self.cameras]
@@ -95,8 +98,8 @@ class Subject:
         px, is_seen = places(self.asset.means, camera)
         ids = np.flatnonzero(is_seen)
         largest = np.sort(self.asset.scales[ids].astype(np.float64), axis=1)[:, 1:].prod(axis=1)
-        # Otherwise windows of a scene would always show the sky: a gaussian that is
-        # twice as large counts twice, whatever its other scales are.
+        # The probability is proportional to the largest scale. Otherwise the windows of
+        # a scene would always show the sky.
         weights = self.asset.opacities[ids] * np.sqrt(largest)
         target = px[rng.choice(ids, p=weights / weights.sum())]
         size = np.minimum([camera.width, camera.height], widest)
@@ -109,7 +112,7 @@ class Subject:
 
     @property
     def published_counts(self) -> dict[str, int]:
-        """Return the numbers of gaussians in the levels by the asset's authors."""
+        """Return the number of gaussians of each level by the asset's authors."""
         return {
             label: level["gaussians"] for label, level in self._about.get("published", {}).items()
         }
@@ -117,8 +120,8 @@ class Subject:
     def peers(
         self, percents: tuple[float, ...]
     ) -> Iterator[tuple[float | str, str, v3dg.Gaussians]]:
-        """Return others' levels: the percentage or published name, the tool, and the
-        gaussians."""
+        """Yield the levels of other tools and of the asset's authors: the percentage or
+        published name, the name of the method, and the gaussians."""
         for path in sorted((self._folder / "peers" / self.name).glob("*_*")):
             tool, _, percent = path.name.removesuffix(path.suffix).rpartition("_")
             if float(percent) in percents:
@@ -128,7 +131,7 @@ class Subject:
 
 
 def places(means: Any, camera: v3dg.Camera) -> tuple[Any, Any]:
-    """Return (N, 2) px of (N, 3) means, and (N,) whether they are in the picture."""
+    """Project means; return (N, 2) px, and (N,) whether they are in the picture."""
     seen = means.astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     is_before = seen[:, 2] > camera.near
     depth = np.where(is_before, seen[:, 2], 1)
@@ -139,8 +142,8 @@ def places(means: Any, camera: v3dg.Camera) -> tuple[Any, Any]:
 
 
 def scaled(camera: v3dg.Camera, scale: float) -> v3dg.Camera:
-    """Return the camera with a multiple of the resolution; its sides are rounded up to
-    whole px."""
+    """Return the camera with its resolution multiplied; width and height are rounded up
+    to whole px."""
     width, height = (math.ceil(scale * side) for side in (camera.width, camera.height))
     K = camera.K * np.array([[scale], [scale], [1.0]])
     K[:2, 2] += (np.array([width, height]) - scale * np.array([camera.width, camera.height])) / 2
@@ -148,12 +151,12 @@ def scaled(camera: v3dg.Camera, scale: float) -> v3dg.Camera:
 
 
 def pack_level(path: Path, gaussians: v3dg.Gaussians) -> None:
-    """Write gaussians in about 27 bytes each, plus at least half a byte for each
-    coefficient of higher degree.
+    """Write gaussians in about 27 bytes each, plus at least half a byte for each SH
+    coefficient above degree 0.
 
-    Means have 17 bits of mantissa. Coefficients of higher degrees are stored as a byte
-    of their square root, which preserves small ones. The error in pictures is far
-    smaller than that of the levels.
+    Means have 17 bits of mantissa. SH coefficients above degree 0 are stored as the
+    square root in one byte, which preserves small values. The error in pictures is far
+    smaller than the error of the levels.
     """
     sh = gaussians.sh.reshape(len(gaussians), -1)
     base, rest = sh[:, :3], sh[:, 3:]
@@ -173,7 +176,7 @@ def pack_level(path: Path, gaussians: v3dg.Gaussians) -> None:
 
 
 def read_level(path: Path) -> v3dg.Gaussians:
-    """Read a file of `pack_level`, or any asset."""
+    """Read a file of `pack_level`, or an asset in any format that v3dg reads."""
     if path.suffix != ".npz":
         return v3dg.read_asset(path)
     with np.load(path) as file:

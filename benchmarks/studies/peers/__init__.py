@@ -1,5 +1,5 @@
-"""Our frames and gradients in comparison with those of other rasterizers, in one run.
+"""Frames and gradients of v3dg in comparison with other rasterizers, in one run.
 
 `measure` records the measurements, `scenes` and `draw` define the scenes and renderers,
-and `report` makes a page of one or more results.
+and `report` makes a page from one or more results.
 """

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.studies.peers`; measure.py says what it does."""
+"""The command `python -m benchmarks.studies.peers`, which runs measure.py."""
 
 import tyro
 

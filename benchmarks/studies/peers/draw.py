@@ -1,8 +1,9 @@
-"""The renderers that `peers` compares: how each gets a scene, draws it, and is used in
-training.
+"""The renderers that `peers` compares: how each renderer loads a scene, draws a frame,
+and runs a training step.
 
-Each is used as in its authors' example or renderer. Everything that does not depend on
-a camera, and the tensors of a camera, are prepared before the time is measured.
+Each renderer is used in the same way as in its authors' example or viewer. Data that do
+not depend on the camera, and the tensors of the camera, are prepared before time is
+measured.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from v3dg import _core
 from v3dg.cameras import Camera
 
 Draw: TypeAlias = Callable[[], Any]
-"""Draws a frame; the `picture` of its renderer converts the result."""
+"""Draws a frame; the renderer's `picture` converts the result to a picture."""
 Prepare: TypeAlias = Callable[[Subject, float], Callable[[Camera], Draw]]
 Step: TypeAlias = "Callable[[Raw, Camera, float, Any], Trained]"
 
@@ -60,42 +61,44 @@ class Trained:
 
     forward: Draw
     step: Callable[[], tuple[Any, ...]]
-    """Forward and backward; returns gradients."""
+    """Runs a forward and a backward pass; returns gradients."""
     named: Callable[[tuple[Any, ...]], dict[str, Any]]
-    """Those gradients by the names of `ROWS`."""
+    """Converts these gradients to a dict with the names of `ROWS`."""
 
 
 @dataclass(frozen=True)
 class Peer:
-    """A renderer, or one of the ways to use it."""
+    """A renderer in one of its modes."""
 
     name: str
     prepare: Prepare
     picture: Callable[[Any], Any] = lambda frame: frame
-    """Return (H, W, 3) of what was drawn, on black; floats are from 0 to 1."""
+    """Converts a drawn frame to a picture (H, W, 3) on black; floats are 0 to 1."""
     train: Step | None = None
     keeps: Callable[[Subject, float], tuple[str, ...]] = lambda subject, filter_px2: INPUTS
-    """The subject's gaussians that it draws from; it has copies of the others."""
+    """Names of the subject's arrays that the renderer reads directly; it holds copies
+    of the other arrays."""
     sh_degrees: tuple[int, ...] = (0, 1, 2, 3)
     differs: str = ""
-    """Differences to gsplat 1.5 that affect errors."""
+    """Differences from gsplat 1.5 that affect errors."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """The measurements of one process."""
+    """The renderers that one process measures."""
 
     name: str
-    """Also the folder that is put in front of Python's path."""
+    """Name of the job, and of the folder that is put at the front of Python's path."""
     module: str
-    """The module without which nothing can be measured."""
+    """A module that must be importable; without it the job is skipped."""
     peers: tuple[Peer, ...]
     filter_px2: float | None = None
-    """The only filter that was compiled in."""
+    """The filter variance in px² for which the renderer was compiled; None for any."""
 
 
 def differentiate(draw: Callable[[Raw, Camera, float], Any]) -> Step:
-    """Return the training step of a function from gaussians to a picture (H, W, 3)."""
+    """Return the training step of a function that draws a picture (H, W, 3) from
+    gaussians."""
 
     def train(raw: Raw, camera: Camera, filter_px2: float, weights: Any) -> Trained:
         import torch
@@ -114,12 +117,12 @@ def differentiate(draw: Callable[[Raw, Camera, float], Any]) -> Step:
     return train
 
 
-# v3dg
-
-
 def v3dg_renderer(min_transmittance: float | None) -> Prepare:
-    """Return the renderer of v3dg. If `min_transmittance` is None, pixels of scenes and
-    bundles stop at the default transmittance, and those of assets as in gsplat."""
+    """Return the renderer of v3dg with a transmittance at which pixels stop.
+
+    If `min_transmittance` is None, scenes and bundles use v3dg's default, and assets
+    use the value of gsplat.
+    """
 
     def prepare(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
         whole, device = subject.whole(filter_px2), subject.gaussians.means.device.type
@@ -142,8 +145,8 @@ def v3dg_renderer(min_transmittance: float | None) -> Prepare:
 
 
 def v3dg_keeps(subject: Subject, filter_px2: float) -> tuple[str, ...]:
-    """Return the inputs that are not copied: an asset is drawn from its arrays, a scene
-    and a bundle from resident data."""
+    """Return the names of the arrays that are not copied. An asset is drawn directly
+    from its arrays; a scene or a bundle is drawn from copies."""
     return INPUTS if subject.layout is None and filter_px2 == 0 else ()
 
 
@@ -153,9 +156,6 @@ def v3dg_rasterize(subject: Subject, filter_px2: float) -> Callable[[Camera], Dr
 
 def v3dg_training(raw: Raw, camera: Camera, filter_px2: float) -> Any:
     return v3dg.rasterize(raw.gaussians(), camera, filter_px2=filter_px2).color
-
-
-# gsplat
 
 
 def gsplat_rasterization(packed: bool) -> Prepare:
@@ -176,7 +176,7 @@ def gsplat_training(packed: bool) -> Step:
 
 
 def higs(sh_compression: str) -> Prepare:
-    """Return gsplat's inference renderer, from its main branch after 1.5."""
+    """Return the inference renderer of gsplat's main branch after version 1.5."""
 
     def prepare(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
         from gsplat.experimental.render import GaussianInferenceRenderer
@@ -208,15 +208,12 @@ def higs(sh_compression: str) -> Prepare:
 
 
 def higs_picture(done: Any) -> Any:
-    """Return the picture without its transmittance."""
+    """Return the picture of a frame without its transmittance."""
     return done.frame[0, ..., :3]
 
 
-# Faster-GS
-
-
 def fastergs_inputs(raw: Raw) -> tuple[Any, ...]:
-    """Return the inputs in the order of its functions' arguments."""
+    """Return the inputs in the order of Faster-GS's arguments."""
     rest = raw.sh[:, 1:].contiguous()
     return (
         raw.means,
@@ -281,9 +278,6 @@ def fastergs_training(raw: Raw, camera: Camera, filter_px2: float, weights: Any)
     return Trained(forward, lambda: torch.autograd.grad(forward(), leaves, planes), named)
 
 
-# FlashGS
-
-
 def flashgs(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
     import torch
     from flash_gaussian_splatting import ops
@@ -305,7 +299,8 @@ def flashgs(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
     def of(camera: Camera) -> Draw:
         if (camera.K[0, 2], camera.K[1, 2]) != (camera.width / 2, camera.height / 2):
             raise ValueError(
-                "camera: expected the principal point in the middle, FlashGS has no other"
+                "camera: expected the principal point in the middle of the picture, which FlashGS "
+                "requires"
             )
         size = camera.width, camera.height, 16, 16
         place = (
@@ -341,18 +336,19 @@ def flashgs(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
     return of
 
 
-_FLASHGS_FAR = 100.0  # from its example; nothing is that far
+_FLASHGS_FAR = 100.0  # from FlashGS's example; no scene here is that deep
 
 
 def flashgs_picture(color: Any) -> Any:
-    """Return the picture, whose bytes are declared as signed."""
+    """Return the picture. FlashGS declares its bytes as signed, so they are
+    reinterpreted."""
     import torch
 
     return color.view(torch.uint8)
 
 
 def covariances(gaussians: v3dg.Gaussians) -> Any:
-    """Return (N, 6) upper triangles of the gaussians' covariances in the world."""
+    """Return (N, 6) the upper triangles of the covariances in world space."""
     import torch
 
     w, x, y, z = gaussians.quats.unbind(1)
@@ -383,8 +379,8 @@ def keeps(*names: str) -> Callable[[Subject, float], tuple[str, ...]]:
 
 
 def jobs() -> tuple[Job, ...]:
-    """Return the jobs, with v3dg first and again at the end, which shows whether the
-    clock has changed."""
+    """Return the jobs. The first job measures v3dg, and the last one measures it again,
+    which shows whether the clock of the GPU has changed."""
     stop = "pixels of scenes and bundles stop behind what leaves a thousandth of the light"
     ours = (
         Peer(

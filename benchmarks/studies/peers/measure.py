@@ -1,24 +1,26 @@
-"""Our frames and gradients in comparison with those of other rasterizers, in one run:
-times, memory and errors.
+"""Frames and gradients of v3dg in comparison with other rasterizers, in one run: times,
+memory and errors.
 
     python -m benchmarks.studies.peers --layout donutsea.json --asset donut.ply \\
         --captured ASSETS --names Fungi --modules PEERS -o peers.json
 
-It measures the renderers that can be imported: gsplat 1.5, the inference renderer of
-its main branch ("HiGS"), Faster-GS, FlashGS. PEERS has a folder for each that is put in
-front of Python's path: `gsplat`, `higs`, and, because the other two have the filter
-compiled in, `fastergs_0`, `fastergs_0.3`, `flashgs_0` and `flashgs_0.3`. Each is
-measured in a separate process, so that a failure does not affect the others; the result
-contains failures with their messages.
+The study measures the renderers that can be imported: gsplat 1.5, the inference
+renderer of gsplat's main branch ("HiGS"), Faster-GS and FlashGS. PEERS has a folder for
+each renderer, which is put at the front of Python's path. The folders are named
+`gsplat` and `higs` and, for renderers whose filter is a compile-time constant,
+`fastergs_0`, `fastergs_0.3`, `flashgs_0` and `flashgs_0.3`. A separate process measures
+each renderer, so that a failure does not affect other renderers. The result records
+failures with their messages.
 
-ASSETS is a folder as for `pairs`. Instances are drawn without a filter, assets and
-random gaussians with 0.3 px², as in training, and, at the first size, without one.
-Times are of CUDA events around single calls from idle device to idle device, so
-Python's part is included. Errors are relative to float64, in eight windows of each
-picture. Memory is that of the process on the device while it draws, without inputs that
-the renderer has copied. A training step starts from logarithms of scales and logits of
-opacities, as in optimisers, and its loss is a weighted sum of the picture's colours.
-Gradients of few gaussians are compared with float64's.
+ASSETS is a folder as for `pairs`. Instances are drawn without a filter. Assets and
+random gaussians are drawn with 0.3 px², as in training, and at the first size also
+without a filter. Times are taken with CUDA events around single calls, from idle device
+to idle device, so Python's overhead is included. Errors are relative to float64, in
+eight windows of each picture. Memory is the memory of the process on the device while
+it draws, without inputs that the renderer has copied. A training step starts from
+logarithms of scales and logits of opacities, as optimisers store them. Its loss is a
+weighted sum of the picture's colours. Gradients for few gaussians are compared with
+gradients in float64.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ Row = dict[str, Any]
 
 _WARM_UPS = 3
 _LEAST_REPEATS, _MOST_REPEATS = 7, 51
-_SMALL = 20_000, 320, 180  # gaussians and picture size for the comparison of gradients with float64
+# Gaussians, width and height for the comparison of gradients with float64.
+_SMALL = 20_000, 320, 180
 _TRUTHS = "truths"
 _OURS = "v3dg"
 
@@ -58,40 +61,40 @@ _OURS = "v3dg"
 @dataclass
 class Config:
     asset: Path | None = None
-    """A .ply file; by default the procedural asset."""
+    """Trained asset, a .ply file; by default the generated asset."""
     layout: Path | None = None
-    """A layout of instances of that asset; without one, that part is left out."""
+    """Layout of instances of that asset; by default no layout is measured."""
     cameras: tuple[int, ...] = (45, 50, 55, 59)
-    """Indices of the layout's cameras."""
+    """Indices of cameras of the layout."""
     captured: Path | None = None
-    """A folder with assets.json; without one, that part is left out."""
+    """Folder with assets.json; by default no captured asset is measured."""
     names: tuple[str, ...] = ()
     """Names of assets in that folder."""
     counts: tuple[int, ...] = (1_000_000, 4_000_000, 20_000_000)
-    """Number of random gaussians."""
+    """Numbers of random gaussians."""
     sh_degree: int = 3
     """SH degree of the random gaussians."""
     widths: tuple[int, ...] = (1920, 3840)
-    """px; pictures are 16 : 9."""
+    """Widths of pictures in px; pictures have an aspect ratio of 16:9."""
     train_at_most: int = 4_000_000
-    """Number of gaussians in the scenes of training."""
+    """Maximum number of gaussians in a scene for which training steps are measured."""
     modules: Path | None = None
-    """Folder with a folder for each of the other renderers."""
+    """Folder that contains a folder for each of the other renderers."""
     jobs: tuple[str, ...] = ()
-    """Names of the folders to run; all by default."""
+    """Names of the jobs to run; by default all."""
     seconds: float = 0.4
-    """Seconds to spend on a row, within 7 to 51 repeats."""
+    """Time in seconds to spend on a row; there are always 7 to 51 repeats."""
     patience: float = 180.0
-    """Seconds after which a process is terminated."""
+    """Seconds without a result after which a process is terminated."""
     window: int = 128
-    """px per side of the windows that are compared."""
+    """Width and height of the compared windows in px."""
     device: Literal["cpu", "cuda"] = "cuda"
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
 
 
 def subjects(config: Config) -> Iterator[tuple[str, Callable[[], Subject]]]:
-    """Yield names of scenes and their constructors; the largest comes last, because a
-    memory pool never shrinks."""
+    """Yield the name of each scene and a function that creates it. The largest scene
+    comes last, because memory pools never shrink."""
     device = config.device
     for name in config.names:
         yield name, partial(scenes.captured, config.captured or Path(), name, device)
@@ -103,7 +106,7 @@ def subjects(config: Config) -> Iterator[tuple[str, Callable[[], Subject]]]:
 
 
 def views(config: Config, subject: Subject, filter_px2: float) -> Iterator[tuple[Row, Camera]]:
-    """Yield the pictures with a filter: their names and cameras."""
+    """Yield the description and the camera of each picture with a filter."""
     widths = config.widths if filter_px2 == subject.filters_px2[0] else config.widths[:1]
     for width in widths:
         for name, camera in subject.cameras.items():
@@ -113,8 +116,8 @@ def views(config: Config, subject: Subject, filter_px2: float) -> Iterator[tuple
 
 
 class Book:
-    """Writes each row when it is measured, as a line of JSON, so that a process that
-    ends early leaves its results."""
+    """Writes each row as a line of JSON as soon as it is measured, so that the results
+    of a crashed process remain."""
 
     def __init__(self, folder: Path, job: str) -> None:
         self._path, self._folder, self._job = folder / f"{job}.jsonl", folder, job
@@ -140,7 +143,7 @@ class Book:
 
 
 def work(config: Config, name: str, folder: Path) -> None:
-    """Do the work of one process."""
+    """Run a job; this is the main function of its process."""
     book = Book(folder, name)
     job = next((job for job in jobs() if job.name == name), None)
     if config.modules is not None:
@@ -152,7 +155,7 @@ def work(config: Config, name: str, folder: Path) -> None:
         book.failure({}, error)
         return
     if config.device == "cuda":
-        with gpu.PeakMemory():  # the first one measures an idle process
+        with gpu.PeakMemory():  # records the memory of an idle process
             pass
     for scene, make in subjects(config):
         try:
@@ -176,7 +179,7 @@ def write_truths(config: Config, subject: Subject, book: Book) -> None:
 
 
 def measure(config: Config, job: Job, subject: Subject, book: Book) -> None:
-    """Measure frames of every view, and training steps of the first one."""
+    """Measure frames of every view, and training steps of the first view."""
     filters = [px2 for px2 in subject.filters_px2 if job.filter_px2 in (None, px2)]
     few = len(subject.gaussians) <= config.train_at_most
     for peer in job.peers:
@@ -214,7 +217,7 @@ def frames(config: Config, peer: Peer, subject: Subject, filter_px2: float, book
 
 
 def training(config: Config, peer: Peer, subject: Subject, filter_px2: float, book: Book) -> None:
-    """Measure a step of the first view."""
+    """Measure a training step of the first view."""
     import torch
 
     assert peer.train is not None
@@ -230,17 +233,20 @@ def training(config: Config, peer: Peer, subject: Subject, filter_px2: float, bo
 
 
 def measured(config: Config, draw: Draw, spare: float = 0.0) -> tuple[Row, Any]:
-    """Return times of a call and the device's memory during it, and its result.
+    """Measure a call that draws a frame.
 
     Args:
         spare: Gigabytes in use that the call does not need.
+
+    Returns:
+        Times and device memory, and the frame.
     """
     gigabytes = None
     if config.device == "cuda":
         with gpu.PeakMemory() as memory:
             for _ in range(_WARM_UPS):
                 draw()
-            times_ms(draw, config.device, 1)  # ends with an idle device
+            times_ms(draw, config.device, 1)  # waits until the device is idle
         gigabytes = round(memory.gigabytes - spare, 2)
     first = statistics.median(times_ms(draw, config.device, 3))
     repeats = int(min(max(1e3 * config.seconds / max(first, 1e-3), _LEAST_REPEATS), _MOST_REPEATS))
@@ -258,8 +264,8 @@ def measured(config: Config, draw: Draw, spare: float = 0.0) -> tuple[Row, Any]:
 
 
 def errors_of(picture: Any, camera: Camera, path: Path, side: int) -> Row:
-    """Return the error of the windows of a picture against the truth, both clipped to
-    [0, 1]."""
+    """Return the error of the windows of a picture against the reference windows in the
+    file `path`, with colours clipped to [0, 1]."""
     if not path.exists():
         return {}
     picture = picture.cpu().numpy() if hasattr(picture, "cpu") else np.asarray(picture)
@@ -280,8 +286,8 @@ def errors_of(picture: Any, camera: Camera, path: Path, side: int) -> Row:
 
 
 def compare_gradients(config: Config, job: Job, book: Book) -> None:
-    """Record relative L2 distances of gradients to float64, for few gaussians in a
-    small picture."""
+    """Record the relative L2 distance of gradients to float64 gradients, for few
+    gaussians in a small picture."""
     trainable = [peer for peer in job.peers if peer.train and job.filter_px2 in (None, TRAINED_PX2)]
     if not trainable:
         return
@@ -291,7 +297,8 @@ def compare_gradients(config: Config, job: Job, book: Book) -> None:
     subject = scenes.random(count, config.sh_degree, config.device)
     camera = scenes.at_size(subject.cameras["front"], width, height)
     weights = torch.from_numpy(np.random.default_rng(1).standard_normal((height, width, 3)))
-    wide = subject.gaussians.scales * scenes.TRAINED_WIDTH / width  # as many px as before
+    # Keeps the sizes of gaussians in px.
+    wide = subject.gaussians.scales * scenes.TRAINED_WIDTH / width
     raw = Raw.of(replace(subject.gaussians, scales=wide))
     doubles = Raw(*(getattr(raw, name).double().cpu() for name in ROWS))
     ours = next(peer.train for peer in jobs()[0].peers if peer.train)
@@ -308,7 +315,7 @@ def compare_gradients(config: Config, job: Job, book: Book) -> None:
 
 
 def distances(values: dict[str, Any], truths: dict[str, Any]) -> dict[str, float]:
-    """Return distances relative to the truths' norms."""
+    """Return the L2 distance of each array, relative to the norm of the reference."""
     found = {
         name: float((values[name] - truths[name]).norm() / truths[name].norm()) for name in ROWS
     }
@@ -316,7 +323,8 @@ def distances(values: dict[str, Any], truths: dict[str, Any]) -> dict[str, float
 
 
 def run(config: Config, name: str, folder: Path) -> list[Row]:
-    """Return the rows of one process, and a failure if it failed."""
+    """Run a job in a process; return its rows and, if it failed, a row with the
+    message."""
     book = Book(folder, name)
     process = multiprocessing.get_context("spawn").Process(target=work, args=(config, name, folder))
     process.start()
@@ -354,14 +362,14 @@ def result(config: Config, rows: list[Row]) -> Row:
 
 
 def version_of(config: Config, job: str) -> str | None:
-    """Return the content of the file VERSION in a renderer's folder."""
+    """Return the text of the file VERSION in a renderer's folder; None without one."""
     path = (config.modules or Path()) / job / "VERSION"
     return path.read_text().strip() if config.modules and path.exists() else None
 
 
 def print_table(rows: list[Row]) -> None:
-    """Print, for each picture, our time relative to the fastest other renderer, and all
-    times, PSNR to float64, and memory."""
+    """Print for each picture our time relative to the fastest other renderer, and for
+    each renderer the time, the PSNR to float64 and the memory."""
     pictures: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         key = tuple(row[name] for name in ("scene", "view", "width", "filter_px2"))

@@ -1,5 +1,5 @@
-"""The page of `peers`: tables of all times, errors and memory, from one or more
-recorded results.
+"""The page of `peers`: tables of times, errors and memory, from one or more recorded
+results.
 
     python -m benchmarks.studies.peers.report peers.json -o docs/notes/peers.md
 
@@ -39,12 +39,12 @@ pixels stop where everyone's do.
 @dataclass
 class Report:
     results: tyro.conf.Positional[tuple[Path, ...]]
-    """Output files of `peers`; if two contain a row, the later one is used."""
+    """Output files of `peers`; if a row is in several files, the last one counts."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("peers.md")
 
 
 def family(row: Row) -> str:
-    """Return the renderer of a row: the ways to use one renderer are combined."""
+    """Return the renderer of a row. All modes of a renderer have the same name."""
     if row["renderer"].startswith(_OURS):
         return _LIKE_GSPLAT if row["renderer"].endswith("1e-4") else _OURS
     return str(row["renderer"]).replace(" packed", "")
@@ -64,7 +64,8 @@ def quickest(rows: list[Row], key: tuple[str, ...]) -> dict[tuple[Any, ...], dic
 
 
 def ratio(everyone: dict[str, Row]) -> float | None:
-    """Return our time relative to the fastest other renderer's."""
+    """Return our time divided by the time of the fastest other renderer; None if one of
+    them is missing."""
     peers = [row["ms"] for name, row in everyone.items() if not name.startswith(_OURS)]
     return everyone[_OURS]["ms"] / min(peers) if peers and _OURS in everyone else None
 
@@ -97,8 +98,8 @@ def frame_tables(rows: list[Row]) -> list[str]:
 
 
 def training_table(rows: list[Row], gradients: list[Row]) -> str:
-    """Return the table of each scene's training steps, and the distances of all
-    gradients to float64's."""
+    """Return the table of training steps of each scene, with the largest distance of
+    each renderer's gradients to float64."""
     worst = {row["renderer"]: max(row["relative_l2"].values()) for row in gradients}
     table = []
     for everyone in quickest(rows, ("scene", "width")).values():
@@ -150,7 +151,7 @@ def page(results: list[Row]) -> str:
 
 
 def latest(rows: list[Row]) -> list[Row]:
-    """Return the rows that are not replaced by a later one."""
+    """Return the rows without those that a later row replaces."""
     keys = ("job", "renderer", "scene", "view", "width", "filter_px2")
     return list({tuple(row[name] for name in keys): row for row in rows}.values())
 

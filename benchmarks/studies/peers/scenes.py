@@ -1,4 +1,4 @@
-"""The scenes and cameras of `peers`, and the float64 truth of windows of the
+"""The scenes and cameras of `peers`, and float64 references for windows of their
 pictures."""
 
 from __future__ import annotations
@@ -21,40 +21,45 @@ from v3dg.cameras import Camera
 from v3dg.levels import BuildConfig, build_bundle
 
 TRAINED_PX2 = 0.3
-"""The filter of the original 3DGS code, with which assets are trained."""
+"""Variance in px² of the filter of the original 3DGS code, with which assets are
+trained."""
 
 TRAINED_WIDTH = 1920
-"""Width in px of the pictures for which random gaussians have realistic sizes."""
+"""Width in px of the pictures in which random gaussians have realistic sizes."""
 
-_ONE_LEVEL = 1 << 30  # minimum of clusters for another level, so that only one level is built
+_ONE_LEVEL = 1 << 30  # number of clusters above which another level would be built
 _MOST_IN_A_BUNDLE = 5_000_000
 _SIZE = {"width": TRAINED_WIDTH, "height": TRAINED_WIDTH * 9 // 16}
-_HIGH = 0.9  # fraction of a scene's gaussians below an eye that looks from above
-_DISTANCE = 2.0  # distance of the eye from the middle, in diagonals of the visible part
-_SIGMAS, _MARGIN_PX = 3.34, 2.0  # a gaussian of opacity 1 is below 1/255 at this distance
+_HIGH = 0.9  # fraction of a scene's gaussians below the camera that looks from above
+# Distance of the camera from the middle, in diagonals of the visible part.
+_DISTANCE = 2.0
+# Beyond this distance, a gaussian of opacity 1 has an alpha below 1/255.
+_SIGMAS, _MARGIN_PX = 3.34, 2.0
 _CHUNK = 4_000_000
 
 
 @dataclass(frozen=True)
 class Subject:
-    """Gaussians on a device, as all renderers get them, and their cameras."""
+    """The gaussians on a device, in the form that all renderers get, and the
+    cameras."""
 
     name: str
     gaussians: v3dg.Gaussians
-    """torch tensors, float32, quaternions of length 1."""
+    """torch tensors of float32; quaternions have length 1."""
     cameras: dict[str, Camera]
     filters_px2: tuple[float, ...]
-    """Variances of the filters."""
+    """Variances of filters in px²."""
     layout: Path | None = None
     asset: v3dg.Gaussians | None = field(default=None, repr=False)
-    """The asset of the layout's instances."""
+    """The asset of the layout's instances; None without a layout."""
 
     def whole(self, filter_px2: float) -> v3dg.Scene | v3dg.Bundle | v3dg.Gaussians:
-        """Return the subject with which `v3dg.Renderer` draws the same picture, at a
-        tolerance of 0.
+        """Return the scene, bundle or asset from which `v3dg.Renderer` draws the same
+        picture at a tolerance of 0.
 
         Raises:
-            ValueError: There are too many gaussians to be sorted into a bundle here.
+            ValueError: The subject has too many gaussians to build a bundle for the
+                filter.
         """
         if self.layout is not None and self.asset is not None:
             return _placed(self.layout, self.asset, filter_px2)[0]
@@ -68,7 +73,8 @@ class Subject:
 
 
 def one_level(asset: v3dg.Gaussians, filter_px2: float) -> v3dg.Bundle:
-    """Return all gaussians of an asset, in a bundle without coarser levels."""
+    """Return a bundle with all gaussians of an asset at level 0 and no coarser
+    level."""
     config = BuildConfig(min_clusters=_ONE_LEVEL, asset_filter_px2=filter_px2)
     return build_bundle(asset, config=config, progress=False, device="cpu")
 
@@ -80,8 +86,8 @@ def _placed(
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return the same view with more or fewer pixels; another aspect ratio changes the
-    vertical extent."""
+    """Return the same camera with another resolution. The width keeps its field of
+    view; another aspect ratio changes the vertical field of view."""
     scale = width / camera.width
     K = camera.K * np.array([[scale], [scale], [1.0]])
     K[:2, 2] = width / 2, height / 2
@@ -89,13 +95,14 @@ def at_size(camera: Camera, width: int, height: int) -> Camera:
 
 
 def on_device(gaussians: v3dg.Gaussians, device: str) -> v3dg.Gaussians:
-    """Return tensors with quaternions of length 1, which some renderers require."""
+    """Return the gaussians as tensors with quaternions of length 1, which some
+    renderers require."""
     there = gaussians.torch(device)
     return replace(there, quats=there.quats / there.quats.norm(dim=1, keepdim=True))
 
 
 def instances(layout: Path, asset: Path | None, cameras: tuple[int, ...], device: str) -> Subject:
-    """Return a layout in full detail, without a filter, as its authors draw it."""
+    """Return a layout at full detail, drawn without a filter as by its authors."""
     what = make_asset() if asset is None else v3dg.read_asset(asset)
     scene, views = _placed(layout, what, 0.0)
     chosen = {name: views[name] for name in (list(views)[i] for i in cameras)}
@@ -104,7 +111,7 @@ def instances(layout: Path, asset: Path | None, cameras: tuple[int, ...], device
 
 
 def captured(folder: Path, name: str, device: str) -> Subject:
-    """Return an asset of a folder as for `pairs`, at eye level and from above."""
+    """Return an asset of a folder as for `pairs`, seen at eye level and from above."""
     about = json.loads((folder / "assets.json").read_text())[name]
     asset = v3dg.read_asset(folder / about["file"])
     means = asset.means.astype(np.float64)
@@ -137,8 +144,8 @@ def captured(folder: Path, name: str, device: str) -> Subject:
 
 
 def _from(means: Any, up: Any, slope: float) -> Camera:
-    """Return a camera that sees nine tenths of an object from a height of `slope` times
-    its distance."""
+    """Return a camera that sees 90 % of an object, from a height of `slope` times its
+    distance."""
     aside = np.cross(
         up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.7 * np.linalg.norm(up) else [0.0, 1.0, 0.0]
     )
@@ -150,14 +157,14 @@ def _from(means: Any, up: Any, slope: float) -> Camera:
 
 
 def random(count: int, sh_degree: int, device: str) -> Subject:
-    """Return gaussians with the sizes of training for 1920 x 1080 px."""
+    """Return random gaussians with the sizes that training gives for 1920 x 1080 px."""
     camera = Camera.look_at((0, 0, 0), (0, 1, 0), **_SIZE)
     gaussians = on_device(like_trained(count, camera, device, sh_degree=sh_degree), device)
     return Subject(f"random {count / 1e6:g} M", gaussians, {"front": camera}, (TRAINED_PX2, 0.0))
 
 
 def windows(camera: Camera, side: int) -> list[tuple[int, int, int, int]]:
-    """Return eight squares over the picture, (x0, y0, x1, y1) px."""
+    """Return eight squares of the picture as (x0, y0, x1, y1) in px."""
     boxes = []
     for row in range(2):
         for column in range(4):
@@ -169,8 +176,7 @@ def windows(camera: Camera, side: int) -> list[tuple[int, int, int, int]]:
 
 
 def truths(subject: Subject, camera: Camera, filter_px2: float, side: int) -> list[Any]:
-    """Return the content of each window (h, w, 3), in float64; the background is
-    black."""
+    """Return the float64 reference of each window, (h, w, 3) on black."""
     boxes = windows(camera, side)
     rows = _touching(subject.gaussians, camera, filter_px2, boxes).numpy()
     doubles = _core.Rows(*(getattr(rows, f.name).astype(np.float64) for f in fields(rows)))
@@ -185,8 +191,8 @@ def _touching(
     filter_px2: float,
     boxes: list[tuple[int, int, int, int]],
 ) -> v3dg.Gaussians:
-    """Return the gaussians that may reach a window, and some that do not: the test uses
-    the ball of the largest axis."""
+    """Return the gaussians that may reach a window. The test uses a ball with the
+    radius of the largest axis, so it also returns some gaussians that do not."""
     import torch
 
     def tensor(array: Any) -> Any:
@@ -199,7 +205,8 @@ def _touching(
         view = gaussians.means[rows].double() @ to_view.T + origin
         depth = view[:, 2].clamp_min(camera.near)
         slope = view[:, :2] / depth[:, None]
-        # The Jacobian's norm, or an upper bound if it is clamped.
+        # The norm of the Jacobian of the projection; an upper bound if the slope is
+        # clamped.
         stretch = focal.max() / depth * (1 + slope.square().sum(1)).sqrt()
         sigma = ((stretch * gaussians.scales[rows].amax(1)) ** 2 + filter_px2).sqrt()
         reach = (_SIGMAS * sigma + _MARGIN_PX)[:, None]

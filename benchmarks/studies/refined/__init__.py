@@ -1,4 +1,5 @@
-"""Cuts of levels before and after refinement.
+"""Errors of cuts before and after a refinement of the levels.
 
-`measure` uses single assets, `worlds` composed scenes.
+`measure` uses single assets, `worlds` uses composed scenes, and `steps` compares ways
+to refine.
 """

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.studies.refined`; measure.py says what it does."""
+"""The command `python -m benchmarks.studies.refined`, which runs measure.py."""
 
 import tyro
 

@@ -1,16 +1,18 @@
-"""Cuts of levels before and after refinement.
+"""Errors of cuts before and after a refinement of the levels.
 
-    python -m benchmarks.studies.refined --asset donut.ply --layout donutsea.json -o
-    refined python -m benchmarks.studies.refined --asset donut.ply --picture refined.png
-    --device cpu python -m benchmarks.studies.refined --asset room.ply --eyes
-    transforms.json -o refined
+    python -m benchmarks.studies.refined --asset donut.ply --layout donutsea.json \\
+        -o refined
+    python -m benchmarks.studies.refined --asset donut.ply --picture refined.png \\
+        --device cpu
+    python -m benchmarks.studies.refined --asset room.ply --eyes transforms.json \\
+        -o refined
 
-With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its
-cameras, against all gaussians at 3 x 3 samples per pixel. With a picture, the asset,
-and a cut with a sixth of its gaussians at three times its native size, before and after
-refinement. With eyes, which are cameras in a scene: errors of cuts with some fractions
-of the gaussians in the frustum, as built, refined from all around, and refined from
-other cameras beside the eyes.
+With `--layout`, the study measures FLIP, PSNR and SSIM of cuts of a layout from some of
+its cameras, against all gaussians at 3 x 3 samples per pixel. With `--picture`, it
+draws the asset and a cut with a sixth of its gaussians at three times the native size,
+before and after the refinement. With `--eyes`, a file of cameras in a scene, it
+measures errors of cuts with some fractions of the gaussians in the frustum: as built,
+refined from all around, and refined from other cameras near the eyes.
 """
 
 from __future__ import annotations
@@ -75,7 +77,8 @@ def pictures(
 def seen_from(
     config: Config, bundles: dict[str, v3dg.Bundle], eyes: list[v3dg.Camera]
 ) -> Iterator[tuple[Row, Picture, Picture]]:
-    """Return errors of cuts from eyes in a scene."""
+    """Yield the description, reference and picture of each cut, seen by cameras in a
+    scene."""
     for number, camera in enumerate(eyes):
         truth = draw_truth(bundles["built"], camera, config.device, _SAMPLES)
         everything = v3dg.select(bundles["built"], camera, tolerance=0, device="cpu").num_gaussians
@@ -84,15 +87,15 @@ def seen_from(
                 budget = {"budget": round(share * everything)} if share < 1 else {"tolerance": 0.0}
                 try:
                     image = v3dg.render(bundle, camera, device=config.device, **budget)
-                # The eye is inside of groups, so even the coarsest cut has too many
-                # gaussians.
+                # The eye is inside the balls of groups, so even the coarsest cut has
+                # too many gaussians.
                 except ValueError:
                     continue
                 yield {"eye": number, "share": share, "levels": name}, truth, to_8bit(image.color)
 
 
 def sheet(config: Config, asset: v3dg.Gaussians, bundles: dict[str, v3dg.Bundle]) -> Picture:
-    """Return the picture of the asset and its cuts."""
+    """Return a picture with the asset and its cuts side by side."""
     budget = len(asset) // _PART
     side = _SIZE * math.ceil(math.sqrt(2 * budget))
     center = np.median(asset.means, axis=0)

@@ -1,14 +1,14 @@
-"""The time and the gain of a refinement: windows a step, cuts a picture of the asset,
-step sizes and numbers of pictures.
+"""The time and the benefit of ways to refine: windows per step, cuts for each picture
+of the asset, step sizes, and numbers of pictures.
 
     python -m benchmarks.studies.refined.steps --donut donut.ply --old OLD -o steps
 
-Two assets are refined in each way: a donut, and eleven of them in a heap, which hide
-each other. OLD is a folder with the package of an older version, which refines the same
-bundles in a third as many steps. FLIP of cuts of some shares of the gaussians, at
-some sizes, is compared with that of the levels as they are built, at equal counts, and
-with that of other ways of the same run. The most important ways come first; none is
-begun after `--seconds`.
+Each way refines two assets: a donut, and a heap of eleven donuts that hide each other.
+OLD is a folder with the package of an older version, which refines the same bundles
+with a third of the steps. Cuts with several fractions of the gaussians are drawn at
+several sizes. Their FLIP is compared with the levels as built at equal numbers of
+gaussians, and with the other ways of the same run. The most important ways come first;
+no way begins after `--seconds`.
 """
 
 from __future__ import annotations
@@ -64,31 +64,32 @@ print(seconds)
 @dataclass
 class Config:
     donut: Path
-    """The paper's donut, or another asset of its size."""
+    """The paper's donut, or another asset of about the same size."""
     old: Path | None = None
-    """A folder with the package `v3dg` of an older version, built."""
+    """Folder with the compiled package `v3dg` of an older version; by default no older
+    version is measured."""
     seconds: float = 140
     assets: tuple[Literal["donut", "heap"], ...] = ("heap", "donut")
     pictures: int = 30_000
-    """Pictures of a refinement, unless a way has another number."""
+    """Number of pictures of a refinement; `share` of a way multiplies it."""
     rate_pictures: int = 4_000
-    """Pictures that the time of one is measured by."""
+    """Number of pictures from which the time per picture is measured."""
     views: int = 2
-    """Sides from which cuts are compared."""
+    """Number of sides from which cuts are compared."""
     device: Literal["cpu", "cuda"] = "cuda"
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
 
 
 @dataclass(frozen=True)
 class Way:
-    """A way to refine."""
+    """The settings of a refinement that are compared."""
 
     windows: int = 8
     cuts_per_view: int = 8
     rate: float = 1.0
-    """Relative to the step sizes of the default."""
+    """Factor of the default step sizes."""
     share: float = 1.0
-    """Of the pictures."""
+    """Factor of the number of pictures."""
 
     def steps(self) -> RefineSteps:
         return RefineSteps(
@@ -98,7 +99,7 @@ class Way:
         )
 
 
-# The most important first.
+# The ways in the order of their importance.
 _WAYS = (
     Way(),
     Way(cuts_per_view=4),
@@ -115,7 +116,7 @@ _WAYS = (
 
 
 def heap_of(donut: v3dg.Gaussians) -> v3dg.Gaussians:
-    """Donuts in a ball, turned at random."""
+    """Return donuts at random positions in a ball, with random rotations."""
     rng = np.random.default_rng(0)
     center = np.median(donut.means, axis=0)
     radius = float(np.quantile(np.linalg.norm(donut.means - center, axis=1), 0.99))
@@ -129,7 +130,7 @@ def heap_of(donut: v3dg.Gaussians) -> v3dg.Gaussians:
 
 @dataclass(frozen=True)
 class View:
-    """A count and a size, seen from one side."""
+    """A number of gaussians and a picture size, seen from one side."""
 
     labels: Row
     count: int
@@ -138,7 +139,7 @@ class View:
 
 
 class Study:
-    """One asset: its bundle as built, and truths that all ways are compared with."""
+    """One asset with its bundle as built, and the reference pictures for all ways."""
 
     def __init__(self, config: Config, name: str, asset: v3dg.Gaussians, folder: Path) -> None:
         self.name = name
@@ -179,7 +180,8 @@ class Study:
                 yield view.labels | row, view.truth, to_8bit(image.color)
 
     def flips(self, bundle: v3dg.Bundle, judges: Judges) -> list[float]:
-        """FLIP at each count and size, means over the views."""
+        """Return the FLIP at each number of gaussians and size, averaged over the
+        views."""
         rows: dict[tuple[float, float], list[Row]] = {}
         for (labels, _, _), measured in judges.measured(self.pictures(bundle), errors):
             row = labels | measured
@@ -187,7 +189,8 @@ class Study:
         return [weighted(of_pair)["flip"] for of_pair in rows.values()]
 
     def milliseconds(self, way: Way) -> float:
-        """The time of a picture, with nothing dropped."""
+        """Return the milliseconds per picture of a refinement that drops no
+        gaussians."""
         steps = way.steps()
         self._cuts(self.built).refined(8 * way.windows, steps)
         cuts = self._cuts(self.built)
@@ -196,7 +199,8 @@ class Study:
         return 1e3 * (time.perf_counter() - start) / self._config.rate_pictures
 
     def refined(self, way: Way, num_pictures: int) -> tuple[v3dg.Bundle, Row]:
-        """The bundle, and seconds of both parts."""
+        """Return the refined bundle, and the seconds of dropping gaussians and of
+        moving them."""
         start = time.perf_counter()
         dropped = without_unseen(self.built, [], 0.02, 0, self._device, False)
         after_drop = time.perf_counter()
@@ -212,7 +216,8 @@ class Study:
 
 
 def refined_by_old(config: Config, study: Study, folder: Path) -> tuple[v3dg.Bundle, Row]:
-    """What an older version makes of the bundle, its number of steps, and seconds."""
+    """Refine the bundle with an older version; return the bundle, and a row with the
+    number of steps and the seconds."""
     num_steps = config.pictures // 3
     output = folder / f"{study.name}_old.v3dg"
     words = [study.path, output, config.device, num_steps]
@@ -231,14 +236,15 @@ def refined_by_old(config: Config, study: Study, folder: Path) -> tuple[v3dg.Bun
 
 
 def compared(flips: list[float], built: list[float]) -> Row:
-    """Geometric mean and range of FLIP relative to the levels as built."""
+    """Return the geometric mean and the range of FLIP relative to the levels as
+    built."""
     ratios = [a / max(b, 1e-9) for a, b in zip(flips, built, strict=True)]
     mean = math.exp(statistics.fmean(math.log(max(ratio, 1e-9)) for ratio in ratios))
     return {"ratio": round(mean, 4), "best": round(min(ratios), 4), "worst": round(max(ratios), 4)}
 
 
 class Results:
-    """Rows that are written as soon as they are known."""
+    """Writes all rows to the file again whenever a row is added."""
 
     def __init__(self, config: Config) -> None:
         self._config = config

@@ -1,15 +1,15 @@
-"""The composed worlds before and after refinement: how few gaussians reach the same
-FLIP.
+"""The composed worlds before and after a refinement of their levels: how few gaussians
+reach the same FLIP.
 
-    python -m benchmarks.studies.refined.worlds --steps 10000 --persons 3 --device cuda
-    -o refined_worlds python -m benchmarks.studies.refined.worlds --report
-    refined_worlds.json
+    python -m benchmarks.studies.refined.worlds --steps 10000 --persons 3 \\
+        --device cuda -o refined_worlds
+    python -m benchmarks.studies.refined.worlds --report refined_worlds.json
 
-Cuts of several tolerances, from near to far cameras, are compared with all gaussians at
-2 x 2 samples per pixel. For each camera, and each FLIP of a cut of the unrefined
-levels, the report has the number of gaussians that reach this FLIP with refined levels,
-relative to the number without refinement; and FLIP at the default tolerance relative to
-that of all gaussians at one sample.
+Cuts at several tolerances, from near and far cameras, are compared with all gaussians
+at 2 x 2 samples per pixel. For each camera and each FLIP of a cut of the unrefined
+levels, the report has the number of gaussians with which refined levels reach this
+FLIP, relative to the number of unrefined levels. It also has FLIP at the default
+tolerance, relative to that of all gaussians at one sample per pixel.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ class Config:
     names: tuple[Literal["forest", "temples", "crowd"], ...] = ("forest", "temples", "crowd")
     scale: Literal["small", "full"] = "full"
     persons: int = 16
-    """Number of different persons in the crowd, each of which has to be refined."""
+    """Number of different persons in the crowd; each of them is refined."""
     cameras: tuple[int, ...] = (43, 47, 51, 55, 59)
-    """Indices of the world's cameras: the fourth to the last of twenty from near to
-    far."""
+    """Indices of the world's cameras. The defaults are distances 4, 8, 12, 16 and 20 of
+    twenty, from near to far."""
     built: tuple[float, ...] = (3.0, 6.0, 9.4)
-    """Tolerances of cuts of the unrefined levels; all gaussians are drawn, too."""
+    """Tolerances for cuts of the unrefined levels; all gaussians are drawn as well."""
     refined: tuple[float, ...] = (3.0, 4.5, 6.0, 9.4, 13.0, 18.0)
-    """Tolerances of cuts of the refined levels."""
+    """Tolerances for cuts of the refined levels."""
     steps: int = 30_000
-    """Steps of the refinement; with 0 only unrefined levels are drawn."""
+    """Steps of the refinement; 0 draws only unrefined levels."""
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
     """Settings of the builds."""
     device: Literal["cpu", "cuda"] = "cpu"
     report: Path | None = None
-    """Recorded results to report; then nothing is measured."""
+    """File of recorded results to report; nothing is measured then."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
 
 
@@ -74,8 +74,8 @@ def make_asset(asset: worlds.Asset) -> v3dg.Gaussians:
 
 
 def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture]]:
-    """Yield the pictures of each world: description, truth and picture; writes build
-    data to `about`."""
+    """Yield the description, reference and picture of each cut; write data about the
+    builds to `about`."""
     how: Row = {"device": config.device, "progress": False}
     for name in config.names:
         world, start = world_of(config, name), time.perf_counter()
@@ -110,8 +110,8 @@ def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture
 
 
 def count_at(flip: float, rows: Sequence[Row]) -> float:
-    """Return the fewest gaussians of these cuts with at most this FLIP, interpolated in
-    the logarithm."""
+    """Return the smallest number of gaussians of these cuts whose FLIP is at most
+    `flip`, interpolated in the logarithm of the number."""
     fewest = math.inf
     finest_first = sorted(rows, key=lambda row: -row["gaussians"])
     for row, coarser in zip(finest_first, [*finest_first[1:], None], strict=True):
@@ -125,11 +125,11 @@ def count_at(flip: float, rows: Sequence[Row]) -> float:
 
 
 def share_at(tolerance: float, built: Sequence[Row], refined: Sequence[Row]) -> float | None:
-    """Return the gaussians with refined levels relative to those without, at the FLIP
-    of one of these cuts.
+    """Return the number of gaussians that refined levels need for the FLIP of an
+    unrefined cut, divided by the number in that cut.
 
-    The result is None if even the coarsest refined cut has a lower FLIP: then fewer
-    gaussians may suffice. If no refined cut reaches this FLIP, nothing is gained.
+    The result is at most 1, and it is 1 if no refined cut reaches the FLIP. It is None
+    if the coarsest unrefined cut has a lower FLIP than the cut at this tolerance.
     """
     flip = next(row["flip"] for row in built if row["tolerance"] == tolerance)
     coarsest = max(built, key=lambda row: row["tolerance"])
@@ -147,7 +147,7 @@ def report(rows: Sequence[Row]) -> None:
         cameras = dict.fromkeys(row["camera"] for row in rows if row["world"] == world)
         sets = [(of(world, camera, "built"), of(world, camera, "refined")) for camera in cameras]
         print(world, *cameras)
-        # Without refined levels there is no ratio.
+        # Without refined levels there are no ratios to report.
         kinds = range(1 + any(cuts[1] for cuts in sets))
         for tolerance in sorted(
             {row["tolerance"] for row in sets[0][0]} - {0.0} if len(kinds) > 1 else ()

@@ -1,6 +1,6 @@
-"""The effect of page pools on frames, memory and the first picture.
+"""The effect of page pools on frames, memory and the time to the first picture.
 
-`measure` flies and teleports over a field of copies; `pool_memory`, `pool_slots` and
-`first_picture` measure one aspect each of such a field, `page_policy.cpp` the
-decisions.
+`measure` draws flights and teleports over a field of copies. `pool_memory`,
+`pool_slots` and `first_picture` each measure one aspect of such a field.
+`page_policy.cpp` measures the decisions about pages.
 """

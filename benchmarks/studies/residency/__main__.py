@@ -1,4 +1,4 @@
-"""`python -m benchmarks.studies.residency`; measure.py says what it does."""
+"""The command `python -m benchmarks.studies.residency`, which runs measure.py."""
 
 import tyro
 

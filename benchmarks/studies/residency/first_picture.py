@@ -1,10 +1,10 @@
-"""The time from the names of files to the first, coarsest picture with a pool.
+"""The time from opening files to the first, coarsest picture with a page pool.
 
-Two kinds of 10 GB are made of one bundle: a set of copies, and one file with the
-clusters of as many copies side by side, whose tables are as large as those of a bundle
-of that size. All copies are at the position of the first. Separate processes open them
-and draw, in alternation with those of another checkout if there is one, with the
-system's file cache dropped before (`cold`) or not.
+Data of 10 GB are made from one bundle in two forms: a set of copies; and one file with
+the clusters of as many copies, whose tables are as large as those of a real bundle of
+that size. All copies are at the same position. Separate processes open the files and
+draw, with the system's file cache dropped before (`cold`) or not. If another checkout
+is given, its processes alternate with those of this one.
 """
 
 from __future__ import annotations
@@ -30,22 +30,23 @@ from v3dg.bundle.codec import codec_of
 from v3dg.bundle.file import BundlePlan, write_pages
 from v3dg.bundle.pages import PageLayout
 
-PATHS = "V3DG_FIRST_PICTURE"  # the variable that contains the files for a child
+# Environment variable that contains the paths for a child process.
+PATHS = "V3DG_FIRST_PICTURE"
 
 
 @dataclass
 class Config:
     bundle: Path
-    """A .v3dg file, which is copied."""
+    """A .v3dg file to copy."""
     folder: Path
-    """Folder for the copies; existing ones are used again."""
+    """Folder for the copies; existing copies are used again."""
     copies: int = 103
     rounds: int = 3
     memory: str = "1GB"
     device: str = "cpu"
     size: tuple[int, int] = (640, 360)
     against: Path | None = None
-    """Another checkout, with a built module, that is measured, too."""
+    """Another checkout with a compiled module to measure as well."""
     output: str | None = None
 
 
@@ -58,8 +59,8 @@ def write_set(config: Config) -> list[Path]:
 
 
 def write_joined(config: Config) -> Path:
-    """Write one bundle with the clusters of all copies: by level, and in each level
-    copy by copy."""
+    """Write one bundle with the clusters of all copies, sorted by level, and by copy
+    within each level."""
     path = config.folder / f"joined_{config.copies}.v3dg"
     if path.exists():
         return path
@@ -92,7 +93,7 @@ def write_joined(config: Config) -> Path:
     file = one._file
     assert file is not None
     places, hashes = file.places, file.tables["pages.hash"]
-    parent_level = g.level  # of page g, except for the last page
+    parent_level = g.level  # level of the parents of page g; the last page has none
     with open(path, "wb", buffering=0) as out, open(config.bundle, "rb") as source:
         at, made_hashes = len(plan.header), []
         for level in range(1, one.num_levels):
@@ -112,7 +113,8 @@ def write_joined(config: Config) -> Path:
 
 
 def drop_cached(paths: list[Path]) -> None:
-    """Ask the system to drop the files from its cache, if it supports that."""
+    """Ask the operating system to drop the files from its cache, where it supports
+    that."""
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY)
         os.fsync(descriptor)
@@ -123,7 +125,7 @@ def drop_cached(paths: list[Path]) -> None:
 
 
 def open_and_draw(config: Config, paths: list[Path]) -> dict[str, Any]:
-    """Return the milliseconds of each step. The module is imported before."""
+    """Return the milliseconds of each step. Importing the module is not measured."""
     if config.device != "cpu":
         import torch
 

@@ -2,12 +2,13 @@
 different copies.
 
 Copies of a bundle are written with slightly different colours of all gaussians, so that
-no two share a page, and are placed in a grid. Pools have several sizes, as multiples of
-what a view needs, and the files are in the system's cache or not. It measures the time
-of frames, the bytes that come in, the number of missing pages, and the error against
-the settled picture; after a teleport also the errors of both against all gaussians at 4
-x 4 samples. The row without a pool shows whether everything would fit. On a GPU, rows
-contain the process's device memory.
+no two copies share a page. They are placed in a grid. Pools have several sizes,
+relative to the memory that a view needs, and the files are in the system's cache or
+not. The study measures the time of frames, the bytes read, the number of missing pages,
+and the error against the settled picture. After a teleport, it also measures the errors
+of both pictures against all gaussians at 4 x 4 samples per pixel. The row without a
+pool shows the frames when everything is resident. On a GPU, rows also have the device
+memory of the process.
 """
 
 from __future__ import annotations
@@ -36,29 +37,30 @@ from v3dg.metrics import psnr
 @dataclass
 class Config:
     bundle: Path
-    """A .v3dg file, of which copies are made."""
+    """A .v3dg file to copy."""
     side: int = 3
     """Number of copies per side of the grid."""
     size: tuple[int, int] = (640, 360)
     tolerance: float = 3.0
     frames: int = 120
-    """Frames of a flight across the field."""
+    """Number of frames of a flight across the field."""
     hz: float = 0.0
-    """Frames per second of flights and teleports; 0 for as many as possible."""
+    """Frames per second of flights and teleports; 0 for as fast as possible."""
     shares: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
-    """Slots of each pool, relative to the largest need of a view in the flight."""
+    """Numbers of slots of the pools, relative to the largest number that a view of the
+    flight needs."""
     pools: tuple[str, ...] = ()
-    """Sizes of further pools, such as 2GB."""
+    """Sizes of more pools, such as 2GB."""
     device: str = "cpu"
     is_whole_drawn: bool = True
-    """Whether everything is also drawn without a pool."""
+    """Whether the field is also drawn without a pool."""
     folder: Path | None = None
-    """Folder for the copies."""
+    """Folder for the copies; by default a temporary one."""
     output: str | None = None
 
 
 def write_copies(config: Config, folder: Path) -> list[Path]:
-    """Write bundles like the given one, each with different colours."""
+    """Write copies of the bundle, each with different colours."""
     paths = [folder / f"copy_{number}.v3dg" for number in range(config.side**2)]
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as processes:
         list(processes.map(write_copy, [config.bundle] * len(paths), range(len(paths)), paths))
@@ -77,7 +79,7 @@ def write_copy(of: Path, number: int, path: Path) -> None:
 
 
 class Field:
-    """Copies in a grid of unit spacing, and cameras over it."""
+    """A grid of copies at distances of 1, and cameras above it."""
 
     def __init__(self, config: Config, paths: list[Path]) -> None:
         self.config, self.paths = config, paths
@@ -92,7 +94,8 @@ class Field:
             self.scene.add(bundle, positions=place - middle, scales=scale)
 
     def camera(self, at: float) -> v3dg.Camera:
-        """Return a camera; `at` is from 0 at the near edge to 1 at the far one."""
+        """Return a camera above the field; `at` is 0 at the near edge and 1 at the far
+        edge."""
         width, height = self.config.size
         across, along = 0.5 * (self.config.side - 1), at * self.config.side - 0.8
         eye = (across + 0.3 * np.sin(6 * at), along, 0.6)
@@ -103,7 +106,8 @@ class Field:
         return [self.camera(at) for at in np.linspace(0, 0.8, self.config.frames)]
 
     def drop_cached_pages(self) -> None:
-        """Ask the system to drop the files from its cache, if it supports that."""
+        """Ask the operating system to drop the files from its cache, where it supports
+        that."""
         for path in self.paths:
             descriptor = os.open(path, os.O_RDONLY)
             os.fsync(descriptor)
@@ -111,7 +115,7 @@ class Field:
             os.close(descriptor)
 
     def memory(self, num_slots: int) -> int:
-        """Return the bytes of a pool with about this many slots."""
+        """Return the bytes of a pool with about `num_slots` slots."""
         bundles = self.scene.bundles
         degree = max(bundle.sh_degree for bundle in bundles)
         num_sh = 3 * (degree + 1) ** 2
@@ -135,8 +139,8 @@ class Field:
 def timed(
     config: Config, renderer: v3dg.Renderer, cameras: list[v3dg.Camera], kept: Collection[int] = ()
 ) -> list[dict[str, Any]]:
-    """Draw pictures one after the other; return the time and stats of each, and some of
-    the pictures."""
+    """Draw pictures one after the other; return the time and the statistics of each,
+    and the pictures whose numbers are in `kept`."""
     frames, start = [], time.perf_counter()
     for number, camera in enumerate(cameras):
         if config.hz:
@@ -162,14 +166,15 @@ def summary(frames: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def errors(frames: list[dict[str, Any]], truth: dict[int, np.ndarray]) -> dict[str, Any]:
-    """Return the PSNR of some pictures against the settled ones; equal pictures count
-    as 100 dB."""
+    """Return the mean and the smallest PSNR of pictures against the settled ones; equal
+    pictures count as 100 dB."""
     values = [min(100.0, float(psnr(truth[number], frames[number]["picture"]))) for number in truth]
     return {"mean_psnr": float(np.mean(values)), "least_psnr": float(np.min(values))}
 
 
 def bytes_on_device(config: Config) -> int | None:
-    """Return the memory in use on a GPU, which nobody else should use meanwhile."""
+    """Return the memory in use on the GPU; other processes must not use the GPU
+    meanwhile."""
     if config.device == "cpu":
         return None
     import torch
@@ -185,7 +190,7 @@ def pixels(image: v3dg.Image) -> np.ndarray:
 def teleport(
     config: Config, field: Field, memory: int, truth: np.ndarray, *, cold: bool
 ) -> dict[str, Any]:
-    """Teleport from one end of the field to the other, and draw pictures until nothing
+    """Teleport from one end of the field to the other, and draw pictures until no page
     is missing."""
     renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
     renderer.settle(field.camera(0), tolerance=config.tolerance)
@@ -209,7 +214,8 @@ def teleport(
         frame["psnr"] = min(100.0, float(psnr(settled, picture)))
         frame["psnr_to_truth"] = float(psnr(truth, picture))
     far = [number for number, frame in enumerate(curve, 1) if frame["psnr_to_truth"] < best - 0.5]
-    near = far[-1] if far else 0  # the first picture from which on all are within 0.5 dB
+    # Number of the first picture after which all pictures are within 0.5 dB.
+    near = far[-1] if far else 0
     return {
         "cold": cold,
         "frames_until_settled": len(curve),
@@ -238,7 +244,7 @@ def main(config: Config) -> None:
             truth[number] = pixels(roomy.render(cameras[number], tolerance=config.tolerance))
         del roomy
         result: dict[str, Any] = {
-            # Paths are recorded without folders.
+            # Paths are recorded without their folders.
             "config": {k: str(getattr(v, "name", v)) for k, v in vars(config).items()},
             "gaussians": sum(bundle.num_gaussians for bundle in field.scene.bundles),
             "leaves": sum(

@@ -1,12 +1,13 @@
-// What a pool of pages costs the thread that draws, and the one that decides, with about 40,000
-// pages in view:
+// The CPU time of a pool of pages with about 40,000 pages in view, for the drawing thread and for
+// the thread that decides which pages to read:
 //
 //   cmake --preset cpu && cmake --build build/cpu --target page_policy && build/cpu/page_policy
 //
-// A row of 169 made bundles, 1.4 million pages, of which a window is needed and another one around
-// it nearly; it moves by 150 pages a frame, and then to the other end. Nothing is drawn or read
-// from a disk. Times are of the processor: of the thread that draws, and, without threads of the
-// pool's own, of all that is decided.
+// The scene is a row of 169 generated bundles with 1.4 million pages. The pages in a window of the
+// row are needed, and the pages of a margin around it are nearly needed. The window moves by 150
+// pages per frame, and then jumps to the other end of the row. Nothing is drawn, and nothing is
+// read from a disk. Two CPU times are measured: that of the drawing thread; and, in a pool without
+// threads, that of all decisions.
 
 #include <algorithm>
 #include <chrono>
@@ -24,12 +25,13 @@ namespace {
 
 using namespace v3dg;
 
-constexpr int32_t kBundles = 169, kPages = 4096;  // of the finest level of each
-constexpr int64_t kRows = 200;                    // of a cluster
+constexpr int32_t kBundles = 169, kPages = 4096;  // pages of the finest level of a bundle
+constexpr int64_t kRows = 200;                    // gaussians of a cluster
 constexpr size_t kSlots = 120000;
-constexpr size_t kNeeds = 40000, kNearly = 10000;  // at either end of them
+constexpr size_t kNeeds = 40000, kNearly = 10000;  // pages of the window, and of the margin at each end
 
-// Two clusters a page, and a level of half as many pages above each, up to one.
+// A page has two clusters. Each level has half as many pages as the next finer one; the coarsest
+// level has one.
 struct Tree {
     std::vector<int32_t> level, own, parent;
     std::vector<int64_t> offset;
@@ -80,7 +82,7 @@ class Flight {
   public:
     explicit Flight(PagePool& pool, bool reads) : pool_(pool), reads_(reads) {}
 
-    // A frame of the view that begins at a page; what it takes of this thread.
+    // Runs a frame of the window that begins at page `first`, and records the time of this thread.
     void frame(size_t first) {
         const double begin = processor_us();
         pool_.begin_frame(true, Arrive::fading);
@@ -109,7 +111,7 @@ class Flight {
     }
 
   private:
-    // In the order of blocks of a device, which is any.
+    // The order is arbitrary, like that of thread blocks on a GPU.
     void fill(FrameNeeds& needs, size_t first) {
         for (size_t k = 0; k < kNeeds; ++k) {
             const size_t page = first + k;

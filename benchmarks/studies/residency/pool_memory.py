@@ -1,10 +1,10 @@
 """The host memory of a process that flies over a field of copies, with pools and
 without.
 
-The copies are those of `measure.py`. Each flight has a separate process, one after
-another. It measures the time of frames, the process's peak memory (RSS), and hashes of
-some settled pictures, which must be equal for all. `--degree` adds coefficients of
-spherical harmonics to the copies.
+The copies are those of `measure.py`. Each flight runs in a separate process, one after
+another. The study measures the time of frames, the peak memory of the process (RSS),
+and hashes of some settled pictures, which must be equal in all flights. `--degree` adds
+SH coefficients to the copies.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ import v3dg
 from benchmarks.evaluation import record
 from benchmarks.studies.residency import measure as residency
 
-POOL = "V3DG_POOL_MEMORY"  # the variable that contains the pool for a child
+# Environment variable that contains the pool's size for a child process.
+POOL = "V3DG_POOL_MEMORY"
 MIB = 1 << 20
 
 
 @dataclass
 class Config:
     bundle: Path
-    """A .v3dg file, of which copies are made."""
+    """A .v3dg file to copy."""
     folder: Path
-    """Folder for the copies; existing ones are used again."""
+    """Folder for the copies; existing copies are used again."""
     side: int = 18
     degree: int = 3
     pools: tuple[str, ...] = ("none", "512MB")
@@ -50,7 +51,8 @@ class Config:
 
 
 def write_base(config: Config) -> Path:
-    """Write the bundle, quantised, with small coefficients up to the degree."""
+    """Write the bundle with quantised codes, and with small SH coefficients up to
+    `degree`."""
     path = config.folder / "base.v3dg"
     if not path.exists():
         bundle = v3dg.Bundle.open(config.bundle)
@@ -76,7 +78,7 @@ def of_copies(config: Config) -> residency.Config:
 
 
 def memory_of_process() -> dict[str, float]:
-    """Return MiB of the process: current, private, and peak."""
+    """Return memory of this process in MiB: resident, private and peak."""
     text = Path("/proc/self/status").read_text(encoding="ascii")
     names = {"rss_mib": "VmRSS", "anonymous_mib": "RssAnon", "most_mib": "VmHWM"}
     found = {name: re.search(rf"{field}:\s*(\d+)", text) for name, field in names.items()}

@@ -1,11 +1,11 @@
-"""Pools that keep rows in comparison with pools that keep codes, for the same quantised
-bundles: frames of a flight in alternation.
+"""Pools that store float32 rows in comparison with pools that store codes, for the same
+quantised bundles. Frames of a flight alternate between the two pools.
 
-A pool keeps rows if a bundle of the scene is float32. So one of the two scenes has an
-additional tiny one, behind the camera.
+A pool stores rows if a bundle of its scene is float32. To get such a pool, one of the
+two scenes has an additional tiny bundle behind the camera.
 
-    python -m benchmarks.studies.residency.pool_slots --bundle quantized.v3dg --side 13
-    --size 1920 1080 --device cuda
+    python -m benchmarks.studies.residency.pool_slots --bundle quantized.v3dg \\
+        --side 13 --size 1920 1080 --device cuda
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ ROUNDS = 3
 
 
 def with_rows(field: Field) -> v3dg.Scene:
-    """Return the scene of the field, and a bundle in memory that no camera sees."""
+    """Return the scene of the field with an additional float32 bundle that no camera
+    sees."""
     scene = Field(field.config, field.paths).scene
     tiny = v3dg.build_bundle(make_donut(1000), config=v3dg.BuildConfig(steps=1), device="cpu")
     scene.add(tiny, positions=(0.0, -1e4, 0.0))

@@ -1,8 +1,8 @@
-"""Assets that need no download: 3DGS assets made from a seed.
+"""Generated 3DGS assets, which are made from a seed and need no download.
 
-Gaussians are distributed as after training: flat ones cover surfaces, needles follow
-thin parts, sizes and opacities vary widely, and colour depends on the view where
-something is glossy or translucent.
+Gaussians are distributed as in trained assets: flat ones cover surfaces, needles follow
+thin parts, sizes and opacities vary widely, and the colours of glossy and translucent
+parts depend on the view.
 """
 
 from benchmarks.worlds.procedural.donut import make_donut

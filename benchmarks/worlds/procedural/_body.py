@@ -1,7 +1,8 @@
-"""Bodies of smoothly joined round cones: the layers of a standing, dressed person.
+"""The surfaces of a standing, dressed person: layers of smoothly joined round cones.
 
-Lengths are in metres for a person of average height, who is scaled as a whole; x is to
-the person's left, the face looks along -y, the soles are at z = 0.
+Lengths are in metres for a person of average height, and a factor scales the whole
+person. The x axis points to the person's left, the face looks along -y, and the soles
+are at z = 0.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ import numpy.typing as npt
 
 from benchmarks.worlds.procedural._parts import UP, Array, unit
 
-_HIPS, _WAIST, _CHEST, _NECK, _HEAD = 0.93, 1.08, 1.29, 1.47, 1.64  # heights
+_HIPS, _WAIST, _CHEST, _NECK, _HEAD = 0.93, 1.08, 1.29, 1.47, 1.64  # heights in metres
 _SIDES = (-1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class _Cone:
-    """The hull of a sphere of radius a at p and one of radius b at q; ``flat``
-    compresses it along y."""
+    """The convex hull of a sphere of radius a at p and a sphere of radius b at q.
+    ``flat`` scales the hull along y."""
 
     p: Array
     q: Array
@@ -36,14 +37,14 @@ def _cone(p: npt.ArrayLike, q: npt.ArrayLike, a: float, b: float, flat: float = 
 
 @dataclass(frozen=True)
 class Shape:
-    """Round cones joined smoothly: a layer of the body or of its clothes."""
+    """A layer of the body or of the clothes: round cones with smooth joints."""
 
     cones: tuple[_Cone, ...]
     blend: float  # radius of the rounding at joints, in metres
 
     def distance(self, points: Array) -> tuple[Array, Array]:
-        """Return the approximate signed distance, negative inside, and its gradient,
-        (n,) and (n,3)."""
+        """Return the approximate signed distance, (n,), negative inside, and its
+        gradient, (n,3)."""
         total, gradient = np.zeros(len(points)), np.zeros((len(points), 3))
         for cone in self.cones:
             axis = cone.q - cone.p
@@ -60,15 +61,16 @@ class Shape:
         return -self.blend * np.log(total), unit(gradient)
 
     def spread(self, n: int, rng: np.random.Generator) -> tuple[Array, Array, float]:
-        """Return n approximately even points on the surface, their normals, and the
-        spacing."""
+        """Return n nearly evenly distributed points on the surface, their normals, and
+        the distance between neighbours."""
         areas = np.array(
             [
                 np.pi * (c.a + c.b) * (np.linalg.norm(c.q - c.p) + c.a + c.b) * (1 + c.flat) / 2
                 for c in self.cones
             ]
         )
-        # More points than needed, because those inside another cone are dropped.
+        # More points than needed are made, because points inside another cone are
+        # dropped.
         many = int(1.6 * n) + 64
         which = rng.choice(len(areas), many, p=areas / areas.sum())
         p, q = (np.stack([getattr(c, name) for c in self.cones])[which] for name in "pq")
@@ -103,29 +105,29 @@ class Shape:
 
 @dataclass(frozen=True)
 class Figure:
-    """A person's layers."""
+    """The layers of a person, and two heights."""
 
-    limbs: tuple[Shape, ...]  # each arm, and the legs if a skirt shows them
+    limbs: tuple[Shape, ...]  # both arms, and the legs if a skirt shows them
     face: Shape  # head and neck
     shirt: Shape
     trousers: Shape
     shoes: Shape
     scalp: Shape
     head: Array  # centre
-    hips: float  # heights
+    hips: float  # height in metres
     shirt_hem: float
     trouser_hem: float
 
 
 @dataclass(frozen=True)
 class _Build:
-    """The differences between people, besides their size."""
+    """The features that differ between persons, besides their size."""
 
     woman: bool
-    stout: float  # 1: average width
-    shoulder: float  # half widths
+    stout: float  # 1 for average width
+    shoulder: float  # half width in metres
     hip: float
-    waist: float  # radii
+    waist: float  # radius in metres
     chest: float
     stride: float
     raised: Array  # (2,) angles between arms and body, radians
@@ -135,7 +137,7 @@ class _Build:
 
 
 def random_figure(rng: np.random.Generator) -> Figure:
-    """Return a person with random build, pose and kind of clothes."""
+    """Return a person with random build, pose and clothes."""
     woman = bool(rng.random() < 0.5)
     size, stout = rng.normal(0.965 if woman else 1.03, 0.035), rng.normal(1.0, 0.09)
     build = _Build(
@@ -189,7 +191,8 @@ def random_figure(rng: np.random.Generator) -> Figure:
 
 
 def _joints(build: _Build, side: float) -> tuple[Array, Array, Array]:
-    """Return hip, knee and ankle; one foot is before the other."""
+    """Return the positions of hip, knee and ankle. One foot is in front of the
+    other."""
     hip = np.array([side * build.hip, 0.0, _HIPS - 0.04])
     knee = np.array([side * 0.095, -0.02 - 0.4 * side * build.stride, 0.50])
     return hip, knee, np.array([side * 0.105, 0.03 + side * build.stride, 0.09])
@@ -216,7 +219,7 @@ def _shoe(build: _Build, side: float) -> list[_Cone]:
 
 
 def _arm(build: _Build, which: int) -> tuple[list[_Cone], list[_Cone]]:
-    """Return an arm with its hand, and its sleeve."""
+    """Return the cones of an arm with its hand, and the cones of its sleeve."""
     side, raised, bent = _SIDES[which], build.raised[which], build.bent[which]
     shoulder = np.array([side * build.shoulder, 0.0, _NECK - 0.105])
     out = np.array([side * np.sin(raised), 0.03, -np.cos(raised)])
@@ -270,8 +273,8 @@ def _torso(build: _Build) -> list[_Cone]:
 
 
 def _face(head: Array) -> list[_Cone]:
-    """Return the skull first, then the face, the ears and the neck; positions are
-    relative to the head's centre."""
+    """Return the skull first, then the face, the ears and the neck, at positions
+    relative to the centre of the head."""
 
     def cone(
         p: Sequence[float], q: Sequence[float], a: float, b: float, flat: float = 1.0

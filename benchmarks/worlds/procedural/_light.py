@@ -1,9 +1,9 @@
-"""Light for assets made of parts: one sun, a sky and the ground's reflection, stored as
+"""Lighting of generated assets: a sun, a sky and the ground's reflection, stored as
 spherical harmonics.
 
-Shadows are computed from the gaussians themselves. From each of a few directions they
-are binned into a grid whose cells hold how much light they block; sums along the
-direction give the light that arrives at each gaussian.
+Shadows are computed from the gaussians. For each of a few directions, the light that
+gaussians block is summed in the cells of a grid. Sums along the direction then give the
+light that arrives at each gaussian.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from benchmarks.worlds.procedural._parts import UP, Array, Part, quaternions, un
 from v3dg import _core
 from v3dg.gaussians import Gaussians
 
-SH_C0 = _core.sh_base0  # value of the constant basis function of spherical harmonics
-SH_C1 = 0.4886025119029199  # factor of the linear basis functions
+SH_C0 = _core.sh_base0  # value of the constant spherical harmonic
+SH_C1 = 0.4886025119029199  # factor of the linear spherical harmonics
 TO_SUN = np.array([0.42, -0.50, 0.76]) / np.linalg.norm([0.42, -0.50, 0.76])
 SUN = np.array([1.55, 1.42, 1.18])
 SKY = np.array([0.42, 0.52, 0.62])
-_CELLS = 1.2e6  # cells of the grid: fine enough for leaves' shadows, coarse enough to be fast
+# Number of grid cells; enough for shadows of leaves, few enough for speed.
+_CELLS = 1.2e6
 _LOBE = 0.30  # width of a highlight; a narrower one would cause ringing at degree 3
 
 
 def sh_basis(directions: Array, degree: int) -> Array:
-    """Evaluate the real spherical harmonics of 3DGS at unit directions (n,3): (n,
-    (degree+1)²)."""
+    """Evaluate the real spherical harmonics of 3DGS at unit directions (n,3); return
+    (n, (degree+1)²)."""
     x, y, z = directions.T
     columns = [np.full(len(directions), SH_C0)]
     if degree >= 1:
@@ -56,21 +57,21 @@ def sh_basis(directions: Array, degree: int) -> Array:
 
 
 def display(linear: Array) -> Array:
-    """Convert linear light to display values, with compressed highlights."""
+    """Convert linear light to display values, and compress highlights."""
     rolled = linear * (1 + linear / 6.0) / (1 + 0.55 * linear)
     return np.clip(rolled, 0, None) ** (1 / 2.2)
 
 
 def _arriving(part: Part, directions: Array, rng: np.random.Generator) -> Array:
-    """Return the fraction of the light from each of D directions that arrives at each
+    """Return the fraction of light from each of D directions that arrives at each
     gaussian, (D,n)."""
-    # The light that a gaussian blocks from any side: its two longest axes determine its
-    # shadow.
+    # The area that a gaussian shades. Its two longest axes determine the area, whatever
+    # the direction of the light.
     stops = np.pi * part.scales[:, 0] * part.scales[:, 1] * part.opacities
     means = part.means.astype(np.float32)
     sides = np.ptp(means, axis=0).astype(np.float64)
     cell = max(float(np.prod(sides) / _CELLS) ** (1 / 3), float(sides.max()) / 256)
-    # Solid gaussians are evaluated above their surface; otherwise they would shade
+    # Opaque gaussians are evaluated above their surface; otherwise they would shade
     # themselves.
     lift = part.normals * (1.5 * (1 - part.translucency))[:, None] + rng.uniform(
         -0.4, 0.4, means.shape
@@ -92,7 +93,7 @@ def _arriving(part: Part, directions: Array, rng: np.random.Generator) -> Array:
         depth = np.bincount(at, stops, int(np.prod(shape))).astype(np.float32).reshape(
             shape
         ) / np.float32(cell**2)
-        for axis in (0, 1):  # softer edges
+        for axis in (0, 1):  # softens the edges of shadows
             depth = 0.5 * depth + 0.25 * (np.roll(depth, 1, axis) + np.roll(depth, -1, axis))
         above = np.exp(-np.cumsum(depth[:, :, ::-1], axis=2)[:, :, ::-1])
         row[:] = above.ravel()[seen]
@@ -100,7 +101,7 @@ def _arriving(part: Part, directions: Array, rng: np.random.Generator) -> Array:
 
 
 def _sky_directions() -> Array:
-    """Return six directions over the upper hemisphere that contribute equally."""
+    """Return six directions on the upper hemisphere that contribute equally."""
     azimuth = np.arange(5) * (2 * np.pi / 5) + 0.4
     height = np.where(np.arange(5) % 2, 0.45, 0.75)
     flat = np.sqrt(1 - height**2)
@@ -110,16 +111,17 @@ def _sky_directions() -> Array:
 
 
 def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.0) -> Array:
-    """Compute the light on gaussians that shade each other, and return their colours as
+    """Compute the light on gaussians that shade each other; return their colours as
     spherical harmonics.
 
     Args:
-        even: Fraction of the light that comes from all around, for assets that will be
-            placed in any orientation.
+        even: Fraction of the light that comes equally from all directions, for assets
+            that will be placed in any orientation.
 
     Returns:
-        (n, (degree+1)², 3). Beyond degree 0: highlights and sky reflections on glossy
-        parts, light through translucent parts, and a little noise, as after training.
+        (n, (degree+1)², 3) coefficients. Above degree 0 they contain highlights and sky
+        reflections of glossy parts, light through translucent parts, and some noise, as
+        after training.
     """
     n, thin = part.normals, part.translucency
     directions = _sky_directions()
@@ -142,10 +144,10 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
     linear = part.albedo * lit
     colour = display(linear)
 
-    # The colour that an eye in direction v sees is a sum of lobes around directions.
-    # The lobe around r has the coefficients w_l Y_lm(r) of a smoothed point, scaled
-    # such that its peak is 1 above its mean. Y is evaluated at the direction from the
-    # eye, which is -v.
+    # The colour seen by an eye in direction v is a sum of lobes around directions. The
+    # lobe around r has the coefficients w_l Y_lm(r) of a smoothed point. They are
+    # scaled such that the lobe's peak is 1 above its mean. Y is evaluated at the
+    # direction from the eye, which is -v.
     bands = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
     smooth = np.exp(-0.5 * _LOBE**2 * bands * (bands + 1))
 
@@ -156,8 +158,8 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
     top = smooth[1:].sum() / (4 * np.pi)
 
     def add(rows: NDArray[np.int64], around: Array, strength: Array) -> None:
-        """Add lobes of ``strength`` (m,3) around unit directions (m,3), without
-        changing the mean colour."""
+        """Add lobes of ``strength`` (m,3) around unit directions (m,3) to some
+        gaussians. The mean colour does not change."""
         coefficients = smooth[1:] / top * sh_basis(-around, degree)[:, 1:]
         sh[rows, 1:] += coefficients[:, :, None] * strength[:, None, :]
 
@@ -180,8 +182,10 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
 def gaussians_of(
     part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.0
 ) -> Gaussians:
-    """Light a part and return it as gaussians in random order, because files of trained
-    assets have no order either."""
+    """Compute the light on a part; return its gaussians in random order.
+
+    Files of trained assets have no order, either.
+    """
     order = rng.permutation(len(part.means))
     sh = light(part, degree, rng, even=even)
     quats = quaternions(part.tangents, part.normals)

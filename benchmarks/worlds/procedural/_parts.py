@@ -1,4 +1,4 @@
-"""Gaussians before lighting, and the shapes that assets are composed of."""
+"""Gaussians without lighting, and the shapes of which assets are composed."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass
 class Part:
-    """n gaussians before lighting. Colours are linear light."""
+    """n gaussians before lighting. Their colours are linear reflectances."""
 
     means: Array  # (n,3)
-    tangents: Array  # (n,3) unit, direction of the first scale
-    normals: Array  # (n,3) unit, direction of the third scale
+    tangents: Array  # (n,3) unit vectors, the axis of the first scale
+    normals: Array  # (n,3) unit vectors, the axis of the third scale
     scales: Array  # (n,3)
     opacities: Array  # (n,)
     albedo: Array  # (n,3)
-    gloss: Array  # (n,) strength of the highlight, 0: matt
-    translucency: Array  # (n,) fraction of the light that passes through, 0: solid
+    gloss: Array  # (n,) strength of the highlight; 0 is matt
+    translucency: Array  # (n,) fraction of light that passes through; 0 is opaque
     occlusion: Array  # (n,) visible fraction of the sky
 
     @staticmethod
@@ -34,7 +34,7 @@ class Part:
         return Part(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Part)))
 
     def first(self, n: int) -> Part:
-        """Return the first n gaussians, to reach an exact count."""
+        """Return the first n gaussians, which gives an exact number."""
         return Part(*(getattr(self, f.name)[:n] for f in fields(Part)))
 
     def moved(self, rotation: Array, translation: Array) -> Part:
@@ -50,7 +50,8 @@ def unit(v: Array) -> Array:
 
 
 def mix(a: Array | Sequence[float], b: Array | Sequence[float], weight: Array) -> Array:
-    """Return colours from ``a`` (weight 0) to ``b`` (weight 1), one row per weight."""
+    """Return colours between ``a`` (weight 0) and ``b`` (weight 1), a row for each
+    weight."""
     w = weight[:, None]
     return np.asarray(a) * (1 - w) + np.asarray(b) * w
 
@@ -68,8 +69,8 @@ def rotation(axis: Array, angle: float) -> Array:
 
 
 class Noise:
-    """Smooth noise in [0,1] over space, interpolated from a periodic lattice of random
-    values."""
+    """Smooth noise in [0,1] as a function of position, interpolated from a periodic
+    lattice of random values."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._lattice = rng.random((32, 32, 32))
@@ -105,19 +106,19 @@ class Noise:
 
 @dataclass
 class Surface:
-    """n points distributed evenly over a surface of revolution around z."""
+    """n evenly distributed points on a surface of revolution around z."""
 
     points: Array  # (n,3)
-    normals: Array  # (n,3) outwards
-    around: Array  # (n,3) unit tangent around the axis
-    along: Array  # (n,) from 0 at the start of the profile to 1 at its end
-    angle: Array  # (n,)
-    spacing: float  # side of the square that one point covers
+    normals: Array  # (n,3) unit vectors that point outwards
+    around: Array  # (n,3) unit tangents around the axis
+    along: Array  # (n,) position on the profile, 0 at its start to 1 at its end
+    angle: Array  # (n,) radians around the axis
+    spacing: float  # side of the square whose area one point represents
 
 
 def revolve(profile: Callable[[Array], tuple[Array, Array]], n: int) -> Surface:
-    """Distribute points in a golden-angle spiral with equal area each; ``profile`` maps
-    [0,1] to radius, height."""
+    """Distribute points with equal area each in a golden-angle spiral. ``profile`` maps
+    [0,1] to radius and height."""
     t = np.linspace(0, 1, 513)
     radius, height = profile(t)
     step = np.hypot(np.diff(radius), np.diff(height))
@@ -130,7 +131,7 @@ def revolve(profile: Callable[[Array], tuple[Array, Array]], n: int) -> Surface:
     angle = np.arange(n) * GOLDEN_ANGLE
     cos, sin = np.cos(angle), np.sin(angle)
     points = np.stack([r * cos, r * sin, z], -1)
-    # The profile runs from the top outwards and down, so its left side is outside.
+    # The profile runs from the top outwards and down, so its left side is the outside.
     normals = np.stack([-slope[:, 1] * cos, -slope[:, 1] * sin, slope[:, 0]], -1)
     around = np.stack([-sin, cos, np.zeros(n)], -1)
     return Surface(points, normals, around, along, angle, float(np.sqrt(area[-1] / max(n, 1))))
@@ -148,12 +149,15 @@ def strips(
     outline: Callable[[Array], Array],
     rng: np.random.Generator,
 ) -> tuple[Part, Array, Array]:
-    """Return K leaves of ``rows`` × ``columns`` gaussians: blades of grass, petals,
-    leaflets.
+    """Make K leaves of ``rows`` × ``columns`` gaussians, such as blades of grass,
+    petals or leaflets.
 
-    A leaf starts at ``base``, extends ``along`` and bends away from ``up`` by ``bend``;
-    ``outline`` maps [0,1] to its half width relative to ``width``. Also returns the
-    position of each gaussian: along its leaf in [0,1], across it in [-1,1].
+    A leaf starts at ``base``, extends ``along`` and bends away from ``up`` by ``bend``.
+    ``outline`` maps [0,1] to the half width as a fraction of ``width``.
+
+    Returns:
+        The leaves, and two positions of each gaussian: along its leaf in [0,1], and
+            across it in [-1,1].
     """
     k = len(base)
     t = (np.arange(rows) + 0.5) / rows
@@ -165,7 +169,7 @@ def strips(
     along, up = unit(along), unit(up - along * np.sum(unit(along) * up, 1, keepdims=True))
     side = np.cross(up, along)
     drop = -bend[:, None] * length[:, None] * t * t
-    curl = 0.25 * half * (s * s)  # edges rise as in a gutter
+    curl = 0.25 * half * (s * s)  # the edges rise, so that the leaf is a shallow gutter
     means = (
         base[:, None]
         + along[:, None] * (length[:, None] * t)[..., None]
@@ -194,8 +198,11 @@ def strips(
 
 
 def quaternions(tangents: Array, normals: Array) -> Array:
-    """Return rotations (w,x,y,z) that map x to the tangent and z to the normal,
-    approximately if the two are not orthogonal."""
+    """Return quaternions (w,x,y,z) of rotations that map x to the tangent and z to the
+    normal.
+
+    If the two are not orthogonal, the tangent is only approximated.
+    """
     z = unit(normals)
     x = tangents - z * np.sum(tangents * z, 1, keepdims=True)
     stray = np.linalg.norm(x, axis=1) < 1e-6
@@ -229,42 +236,45 @@ def quaternions(tangents: Array, normals: Array) -> Array:
 
 
 def allot(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Assign n gaussians to weighted items, in order, as evenly as the weights
-    allow."""
+    """Assign n gaussians to weighted items, in the items' order and as evenly as the
+    weights allow."""
     ends = np.cumsum(weights)
     at = (np.arange(n) + rng.random(n)) / max(n, 1) * ends[-1]
     return np.asarray(np.minimum(np.searchsorted(ends, at, side="right"), len(weights) - 1))
 
 
 def leaf_outline(t: Array) -> Array:
-    """Return the half width along a leaf, at most 1: round at the base, narrow at the
-    tip."""
+    """Return the half width along a leaf, at most 1. The leaf is round at its base and
+    narrow at its tip."""
     return np.sqrt(np.clip(t * (1.06 - t) * 3.6, 0.03, 1))
 
 
 @dataclass
 class Patch:
-    """n points distributed evenly over a parametric surface."""
+    """n evenly distributed points on a parametric surface."""
 
     points: Array  # (n,3)
-    normals: Array  # (n,3) unit, along the cross product of the derivatives by u and v
-    tangents: Array  # (n,3) unit, along the derivative by u
+    # (n,3) unit vectors along the cross product of the derivatives by u and v.
+    normals: Array
+    tangents: Array  # (n,3) unit vectors along the derivative by u
     u: Array  # (n,) in [0,1]
     v: Array  # (n,) in [0,1]
-    room: Array  # (n,2) distances to the surface's borders, along the tangent and across it
+    # (n,2) distances to the borders of the surface, along and across the tangent.
+    room: Array
     area: float
 
     @property
     def spacing(self) -> float:
-        """The side of the square that one point covers."""
+        """The side of the square whose area one point represents."""
         return float(np.sqrt(self.area / max(len(self.u), 1)))
 
 
-SurfaceMap: TypeAlias = Callable[[Array, Array], Array]  # u, v (n,) in [0,1] to points (n,3)
+# Maps u and v (n,) in [0,1] to points (n,3).
+SurfaceMap: TypeAlias = Callable[[Array, Array], Array]
 
 
 def surface_area(surface: SurfaceMap, cells: int = 64) -> float:
-    """Return the area of a parametric surface, computed on a grid with this many cells
+    """Return the area of a parametric surface, computed on a grid with ``cells`` cells
     per side."""
     return float(_cell_areas(surface, cells).sum())
 
@@ -281,9 +291,10 @@ def _cell_areas(surface: SurfaceMap, cells: int) -> Array:
 def sample(
     surface: SurfaceMap, n: int, rng: np.random.Generator, cells: int = 64, *, closed: str = ""
 ) -> Patch:
-    """Distribute n points over a parametric surface, with equal numbers on equal areas.
+    """Distribute n points on a parametric surface, with equal numbers on equal areas.
 
-    ``closed`` names u or v if the surface has no border in that direction.
+    ``closed`` names the parameters, u or v, in whose direction the surface has no
+    border.
     """
     areas = _cell_areas(surface, cells)
     cell = allot(areas, n, rng)
@@ -298,7 +309,8 @@ def sample(
     endless = np.full(n, np.inf)
     room_u = endless if "u" in closed else length_u * np.minimum(u, 1 - u)
     room_v = endless if "v" in closed else length_v * np.minimum(v, 1 - v) * sine
-    # If the surface is skew, its side borders can also be reached across the tangent.
+    # On a skew surface, the borders at the sides can also be reached across the
+    # tangent.
     room = np.stack([room_u, np.minimum(room_v, room_u * sine / np.maximum(cosine, 1e-9))], -1)
     return Patch(points, unit(np.cross(du, dv)), unit(du), u, v, room, float(areas.sum()))
 
@@ -318,29 +330,33 @@ def cover(
     bend: Array | float = np.inf,
     room: Array | None = None,
 ) -> Part:
-    """Return flat gaussians that together cover a surface with points at distances of
+    """Return flat gaussians that together cover a surface, from points at distances of
     ``spacing``.
 
-    Sizes, shapes and opacities are distributed as measured on a trained asset
+    Sizes, shapes and opacities have the distributions of a trained asset
     (docs/worlds.md): the mean size is lognormal, the ratios of neighbouring axes are
-    exponentials of gamma variates, logits of opacities are normal with deviation 2.3
-    around ``opacity``. The long axes are in the surface in all directions or, with
-    ``aligned`` = 1, along the tangents. Axes that would stick out are shortened, as in
-    training: by ``bend``, the surface's smallest radius of curvature (with ``aligned``,
-    the one across the tangents), and by ``room`` (n,2), the distances to its borders
-    along and across the tangents; near a border, long axes are parallel to it.
+    exponentials of gamma variates, and logits of opacities are normal with deviation
+    2.3 around ``opacity``. The long axes lie in the surface, in all directions or, with
+    ``aligned`` = 1, along the tangents.
+
+    Axes that would stick out of the surface are shortened, as by training. ``bend`` is
+    the smallest radius of curvature of the surface; with ``aligned``, only the
+    curvature across the tangents counts. ``room`` (n,2) has the distances to the
+    surface's borders along and across the tangents. Near a border, long axes are
+    parallel to it.
     """
     n = len(points)
     spacing = np.broadcast_to(np.asarray(spacing, dtype=np.float64), n)
     middle_ratio = np.exp(0.4 * rng.gamma(3.0, size=n))
     thin_ratio = np.exp(0.5 * rng.gamma(3.0, size=n))
     size = 0.75 * spacing * np.exp(0.7 * rng.standard_normal(n))
-    # These are large and solid, slightly below the others, so that nothing shines
-    # through the gaps.
+    # These gaussians are large and opaque, and lie slightly below the others, so that
+    # nothing shines through gaps.
     base = rng.random(n) < 0.12
     size[base] = 2.2 * spacing[base]
     middle_ratio[base] = np.minimum(middle_ratio[base], 2)
-    # At two standard deviations, the ends then rise by less than the spacing.
+    # At two standard deviations, the ends of this length rise above the surface by less
+    # than the spacing.
     longest = np.sqrt(0.4 * bend * spacing)
     long, middle = size * np.sqrt(middle_ratio), np.minimum(size / np.sqrt(middle_ratio), longest)
     angle = rng.uniform(-np.pi / 2, np.pi / 2, n) * (1 - aligned) + 0.1 * rng.standard_normal(n)
@@ -348,7 +364,7 @@ def cover(
         beside = room.min(axis=1) < 2 * long
         lengthwise = room[:, 1] <= room[:, 0]
         angle = np.where(beside, np.where(lengthwise, 0.0, np.pi / 2), angle)
-        # Two standard deviations reach the border.
+        # Two standard deviations of this length reach the border.
         space = np.maximum(0.45 * room, 0.22 * spacing[:, None])
         free = np.where(beside, np.where(lengthwise, space[:, 0], space[:, 1]), np.inf)
         long = np.minimum(long, free)

@@ -1,4 +1,4 @@
-"""A glazed donut with sprinkles; its tube's axis is the circle of radius ``RING``
+"""A glazed donut with sprinkles. The axis of its tube is the circle of radius ``RING``
 around the origin."""
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from benchmarks.worlds.procedural._parts import (
 )
 from v3dg.gaussians import Gaussians
 
-RING = 0.068  # radius of the tube's axis
-TUBE = 0.040  # radius of the tube, including icing
+RING = 0.068  # radius of the circle that is the axis of the tube
+TUBE = 0.040  # radius of the tube with icing
 _DOUGH = 0.037
 _SPRINKLES = 260
 _SPRINKLE_COLOURS = np.array(
@@ -40,25 +40,29 @@ _ICINGS = np.array(
 
 
 def _on_tube(around: Array, along: Array, radius: Array) -> Array:
-    """Return points at angles ``around`` the donut's axis and ``along`` the tube's
-    cross-section, 0 at the outside, pi/2 at the top."""
+    """Return points on tubes of ``radius``.
+
+    ``around`` is the angle around the donut's axis. ``along`` is the angle in the
+    cross-section of the tube, 0 at the outside and pi/2 at the top.
+    """
     r = RING + radius * np.cos(along)
     return np.stack([r * np.cos(around), r * np.sin(around), radius * np.sin(along)], -1)
 
 
 def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """Make a donut: baked dough, icing that drips over its rim, sprinkles of six
-    colours.
+    """Make a donut of baked dough, with icing that drips over its rim, and sprinkles of
+    six colours.
 
     Args:
-        num_gaussians: Exact number of gaussians; the default is that of the V3DG
+        num_gaussians: Exact number of gaussians; the default is the number of the V3DG
             paper's donut.
-        seed: The same seed gives the same gaussians. Every fourth seed has pink icing.
-        sh_degree: 0 to 3; the icing is glossy from 1 on, sharpest at 3.
+        seed: The same seed gives the same gaussians. Every fourth seed gives pink
+            icing.
+        sh_degree: 0 to 3; the icing is glossy from degree 1 on, and sharpest at 3.
 
     Returns:
-        NumPy gaussians; z is up, the origin is in the middle of the hole, the diameter
-        is 0.22.
+        Gaussians with NumPy arrays; z is up, the origin is in the middle of the hole,
+        the diameter is 0.22.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
@@ -79,8 +83,8 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         return np.asarray(sum(terms))
 
     def rim(around: Array) -> tuple[Array, Array]:
-        """Return the angles along the cross-section at which the icing ends, outside
-        and in the hole."""
+        """Return the angles in the cross-section at which the icing ends: at the
+        outside and in the hole."""
         outer = 0.10 + waves(around, (0.10, 0.13, 0.14, 0.05), 0)
         inner = np.pi - 0.35 + waves(around, (0.12, 0.10, 0.10, 0.04), 4)
         return outer, inner
@@ -90,7 +94,7 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         outer, inner = rim(around)
         rounded = np.clip(1 - (2 * v - 1) ** 2, 0, 1)
         thick = (TUBE - _DOUGH + 0.0005) * np.minimum(1.0, 3.2 * rounded) ** 0.5
-        # The icing is thicker where it stopped flowing.
+        # Icing is thicker near its edge, where it stopped flowing.
         beads = 1 + 0.25 * np.exp(-((rounded - 0.12) ** 2) / 0.01)
         return _on_tube(around, outer + v * (inner - outer), _DOUGH - 0.0005 + thick * beads)
 
@@ -98,7 +102,7 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         around = 2 * np.pi * u
         outer, inner = rim(around)
         along = inner - 0.15 + v * (2 * np.pi - (inner - outer) + 0.3)
-        # The pale line at the former oil surface.
+        # A pale line marks the surface of the oil in which the donut was baked.
         pinch = 1 - 0.02 * np.exp(-((np.cos(along) - 1) ** 2) / 0.02)
         return _on_tube(around, along, _DOUGH * pinch)
 
@@ -152,7 +156,7 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
 
 
 def _sprinkles(icing: SurfaceMap, n: int, rng: np.random.Generator) -> Part:
-    """Return sugar capsules of n gaussians each, which lie on the icing in all
+    """Return sugar capsules of n gaussians each that lie on the icing in random
     directions."""
     seats = sample(lambda u, v: icing(u, 0.10 + 0.80 * v), _SPRINKLES, rng)
     turn = rng.uniform(0, 2 * np.pi, _SPRINKLES)
@@ -169,7 +173,7 @@ def _sprinkles(icing: SurfaceMap, n: int, rng: np.random.Generator) -> Part:
 
     shape = revolve(capsule, n)
     side = unit(np.cross(axis, seats.normals))
-    frames = np.stack([side, np.cross(axis, side), axis], -1)  # (K,3,3) columns
+    frames = np.stack([side, np.cross(axis, side), axis], -1)  # (K,3,3) axes as columns
 
     def placed(vectors: Array) -> Array:
         return np.asarray(np.einsum("kij,nj->kni", frames, vectors).reshape(-1, 3))

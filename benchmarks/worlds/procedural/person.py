@@ -1,4 +1,4 @@
-"""People: the skin, clothes, shoes and hair of figures."""
+"""Persons with skin, clothes, shoes and hair, made from the figures of `_body`."""
 
 from __future__ import annotations
 
@@ -55,17 +55,17 @@ _TROUSERS = np.array(
 
 
 def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int = 1) -> Gaussians:
-    """Make a standing person in shirt, trousers or skirt, and shoes.
+    """Make a standing person with a shirt, trousers or a skirt, and shoes.
 
     Args:
         num_gaussians: Exact number of gaussians; the default is the mean of the V3DG
             paper's persons.
-        seed: Each seed gives another person: build, pose, skin, hair and clothes.
+        seed: Each seed gives another build, pose, skin, hair and clothes.
         sh_degree: 0 to 3.
 
     Returns:
-        NumPy gaussians; z is up, the soles are at z = 0, the face looks along -y;
-        lengths in metres.
+        Gaussians with NumPy arrays, in metres; z is up, the soles are at z = 0, and the
+        face looks along -y.
 
     Raises:
         ValueError: ``num_gaussians`` is below 2,000.
@@ -107,7 +107,7 @@ def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int =
 
 
 def _seen(figure: Figure, points: Array, *, behind: Sequence[Shape]) -> Array:
-    """Return which points are not hidden by another layer."""
+    """Return (n,) whether points are not hidden by any of the layers ``behind``."""
     free = np.ones(len(points), bool)
     for shape in behind:
         near = np.flatnonzero(
@@ -121,7 +121,8 @@ def _seen(figure: Figure, points: Array, *, behind: Sequence[Shape]) -> Array:
 def _enough(
     shape: Shape, n: int, figure: Figure, behind: Sequence[Shape], rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
-    """Return n points of a layer that no other layer hides."""
+    """Return n points of a layer that no other layer hides, their normals, and the
+    distance between neighbours."""
     probe, _, _ = shape.spread(600, rng)
     share = max(float(_seen(figure, probe, behind=behind).mean()), 0.05)
     points, normals, spacing = shape.spread(int(1.12 * n / share) + 50, rng)
@@ -162,7 +163,7 @@ def _skin(
 
 def _face(at: Array, tone: Array, hair: Array) -> Array:
     """Return the colours of eyes, brows, lips and cheeks at positions relative to the
-    head's centre."""
+    centre of the head."""
     front = at[:, 1] < -0.03
     x, z = np.abs(at[:, 0]), at[:, 2]
 
@@ -199,11 +200,11 @@ def _cloth(
     noise: Noise,
     rng: np.random.Generator,
 ) -> Part:
-    """Return woven cloth with folds: plain, with stripes across or along, or with
-    checks."""
+    """Return woven cloth with folds; its pattern is plain, has stripes across or along,
+    or is checked."""
     on_top = shape is figure.shirt
     points, normals, spacing = _enough(shape, n, figure, () if on_top else (figure.shirt,), rng)
-    # The cloth ends at the hem, where the round cones end in balls.
+    # The cloth ends at the hem; without this cut, the cones would end in balls.
     kept = np.flatnonzero(points[:, 2] > (figure.shirt_hem if on_top else figure.trouser_hem))
     kept = np.concatenate([kept, rng.choice(kept, n - len(kept))])
     points, normals = points[kept], normals[kept]
@@ -259,15 +260,16 @@ def _shoes(figure: Figure, n: int, noise: Noise, rng: np.random.Generator) -> Pa
 
 
 def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:
-    """Return strands of a few needles each that grow from the scalp and fall."""
+    """Return strands of hair that grow from the scalp and hang down, with a few needles
+    each."""
     length = float(rng.choice([0.030, 0.055, 0.20, 0.30]))
     rows = 4 if length < 0.1 else 10
     k = n // rows
     parting = rng.uniform(-0.03, 0.03)
     roots, normals, _ = figure.scalp.spread(4 * k, rng)
     at = roots - figure.head
-    # There is no hair on the face: the hairline runs from the forehead down in front of
-    # the ears.
+    # The face has no hair: the hairline runs from the forehead down in front of the
+    # ears.
     line = 0.060 - 1.15 * np.maximum(at[:, 1] + 0.06, 0) + 0.012 * (noise(roots, 60.0) - 0.5)
     grows = np.flatnonzero((at[:, 2] > line) & (at[:, 2] > -0.075))
     grows = grows[:k] if len(grows) >= k else rng.choice(grows, k)
@@ -277,7 +279,8 @@ def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Gene
     comb = np.stack(
         [np.sign(at[:, 0] - parting) * 0.6, 0.45 + 0.3 * at[:, 1] / 0.1, np.full(k, -0.6)], -1
     )
-    comb -= normals * np.sum(comb * normals, 1, keepdims=True)  # along the scalp
+    # Tangential to the scalp.
+    comb -= normals * np.sum(comb * normals, 1, keepdims=True)
     stray = 0.10 * rng.standard_normal((k, 3)) + 0.8 * (lock - 0.5)[:, None] * np.roll(
         normals, 1, axis=1
     )
@@ -288,7 +291,7 @@ def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Gene
         means.append(points + 0.5 * heading * step)
         tangents.append(heading)
         points = points + heading * step
-        # Hair falls, and slides along head and shoulders.
+        # Hair falls and slides along the head and the shoulders.
         heading = unit(heading - 0.7 * UP + 0.05 * rng.standard_normal((k, 3)))
         for shape, skirt in ((figure.scalp, 0.006), (figure.face, 0.004), (figure.shirt, 0.006)):
             if length < 0.1 and shape is not figure.scalp:

@@ -1,5 +1,5 @@
-"""A Doric temple of weathered marble, with a tiled roof, grass in its steps and ivy on
-a wall."""
+"""A Doric temple of weathered marble, with a tiled roof, grass between its steps and
+ivy on a wall."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from benchmarks.worlds.procedural._parts import (
 )
 from v3dg.gaussians import Gaussians
 
-# Lengths are in metres. Columns stand on a rectangle of 6 x 11; x is parallel to the
-# front, which faces -y.
+# Lengths are in metres. There are 6 x 11 columns around a rectangle; x is parallel to
+# the front, which faces -y.
 _COLUMNS_X, _COLUMNS_Y, _PITCH = 6, 11, 2.35
 _HALF_X, _HALF_Y = (_COLUMNS_X - 1) * _PITCH / 2, (_COLUMNS_Y - 1) * _PITCH / 2
 _STEP, _TREAD = 0.38, 0.42
 _FLOOR = 3 * _STEP
 _SHAFT, _RADIUS = 4.7, 0.52
-_BEAM = _FLOOR + _SHAFT + 0.55  # bottom of the architrave
+_BEAM = _FLOOR + _SHAFT + 0.55  # height of the bottom of the architrave
 _FRIEZE, _CORNICE, _EAVES = _BEAM + 0.75, _BEAM + 1.55, _BEAM + 1.85
 _RIDGE = _EAVES + 1.9
 _OVERHANG = 0.95
@@ -43,12 +43,12 @@ _OVERHANG = 0.95
 
 @dataclass(frozen=True)
 class _Face:
-    """A surface of one material."""
+    """A part of the temple's surface with one material."""
 
     surface: SurfaceMap
     area: float
     material: str
-    bend: float = np.inf  # smallest radius of curvature
+    bend: float = np.inf  # smallest radius of curvature in metres
     cells: int = 8
     closed: str = ""
 
@@ -56,8 +56,8 @@ class _Face:
 def _quad(
     a: Sequence[float], b: Sequence[float], c: Sequence[float], d: Sequence[float]
 ) -> SurfaceMap:
-    """Return the bilinear patch with corners a, b along u, and d, c opposite; its
-    normal is (b - a) x (d - a)."""
+    """Return the bilinear patch with corners a, b along u and corners d, c at the
+    opposite side. Its normal is (b - a) x (d - a)."""
     corners = (np.array(x, dtype=np.float64) for x in (a, b, c, d))
     p, q, r, s = corners
 
@@ -71,8 +71,8 @@ def _quad(
 def _box(
     low: Sequence[float], high: Sequence[float], material: str, sides: str = "xXyYzZ"
 ) -> list[_Face]:
-    """Return the named faces of a box: small letters at ``low``, capitals at
-    ``high``."""
+    """Return some faces of a box: small letters name faces at ``low``, capitals faces
+    at ``high``."""
     (x, y, z), (X, Y, Z) = low, high
     corners = {
         "x": ((x, Y, z), (x, y, z), (x, y, Z), (x, Y, Z)),
@@ -93,8 +93,8 @@ def _flat(corners: Sequence[Sequence[float]], material: str) -> _Face:
 def _ring(
     half_x: float, half_y: float, width: float, bottom: float, top: float, material: str
 ) -> list[_Face]:
-    """Return a beam around a rectangle whose outer sides are at the half lengths,
-    visible from all sides."""
+    """Return a beam along the sides of a rectangle with the given outer half lengths.
+    The beam has faces on all sides."""
     outer = _box((-half_x, -half_y, bottom), (half_x, half_y, top), material, "xXyY")
     inside = (half_x - width, half_y - width)
     a, b = inside
@@ -117,12 +117,14 @@ def _ring(
 
 
 def _column(x: float, y: float) -> list[_Face]:
-    """Return a fluted shaft that narrows upwards, its cushion and its slab."""
+    """Return a fluted shaft that narrows upwards, and the round and the square part of
+    its capital."""
 
     def shaft(v: Array, u: Array) -> Array:
         angle = -2 * np.pi * u
-        radius = _RADIUS * (1 - 0.22 * v + 0.035 * np.sin(np.pi * v))  # entasis
-        flute = np.abs(np.cos(10 * angle))  # 20 flutes that meet in edges
+        # With entasis, the slight bulge of the shaft.
+        radius = _RADIUS * (1 - 0.22 * v + 0.035 * np.sin(np.pi * v))
+        flute = np.abs(np.cos(10 * angle))  # 20 flutes that meet in sharp edges
         radius = radius * (1 - 0.055 * (1 - flute**2))
         return np.stack(
             [x + radius * np.cos(angle), y + radius * np.sin(angle), _FLOOR + _SHAFT * v], -1
@@ -144,8 +146,8 @@ def _column(x: float, y: float) -> list[_Face]:
 
 
 def _frieze() -> list[_Face]:
-    """Return triglyphs, one over each column and one between two, and the plain slabs
-    behind them."""
+    """Return the triglyphs, one above each column and one above each gap, and the plain
+    slabs behind them."""
     faces = _ring(_HALF_X + 0.50, _HALF_Y + 0.50, 1.0, _FRIEZE, _CORNICE, "metope")
     width, step = 0.50, 0.065
     for half, other, count, along in (
@@ -175,11 +177,11 @@ def _roof() -> list[_Face]:
     for sign in (-1.0, 1.0):
 
         def slope(u: Array, v: Array, sign: float = sign) -> Array:
-            """Return rows of flat tiles with round ones over their joints."""
+            """Return rows of flat tiles with round tiles over their joints."""
             across = (columns * u) % 1.0
             down = (rows * v) % 1.0
             hump = 0.085 * smoothstep(0.2, 0.0, np.minimum(across, 1 - across))
-            # The end of a row is not vertical.
+            # The step at the end of a row is steep, but not vertical.
             lift = hump + 0.05 * (down - smoothstep(0.85, 1.0, down))
             y = sign * half_y * (1 - 2 * u)
             x = sign * half_x * v
@@ -198,7 +200,7 @@ def _roof() -> list[_Face]:
         left, right, top = (-half_x, y, _EAVES), (half_x, y, _EAVES), (0.0, y, _RIDGE - 0.1)
         corners = (left, right, top, top) if sign < 0 else (right, left, top, top)
         faces.append(_flat(corners, "pediment"))
-        # The sloping cornice: a beam along each edge of the gable.
+        # A sloping cornice along each edge of the gable.
         for side in (-1.0, 1.0):
             edge, out = (side * half_x, _EAVES), sign * half_y
             low_y, high_y = sorted((y, out))
@@ -245,8 +247,7 @@ def _faces() -> tuple[_Face, ...]:
         for j in range(_COLUMNS_Y):
             if i in (0, _COLUMNS_X - 1) or j in (0, _COLUMNS_Y - 1):
                 faces += _column(-_HALF_X + i * _PITCH, -_HALF_Y + j * _PITCH)
-    # The cella: walls seen from both sides, a doorway in the front one, and its
-    # ceiling.
+    # The cella has walls with two sides, a doorway in its front wall, and a ceiling.
     a, b, door, lintel = _HALF_X - 2.1, _HALF_Y - 2.6, 1.15, _FLOOR + 3.9
     faces += _box((-a, -b, _FLOOR), (a, b, _BEAM), "wall", "xXY")
     faces += _box((-a, -b, _FLOOR), (-door, -b, _BEAM), "wall", "y")
@@ -291,8 +292,8 @@ def _faces() -> tuple[_Face, ...]:
     return (*faces, *_roof())
 
 
-# The density of gaussians on each material, and whether they are aligned with the
-# surface's first direction.
+# The relative density of gaussians on each material, and whether their long axes are
+# aligned with the surface's first direction.
 _DENSITY = {
     "column": 1.3,
     "tile": 1.0,
@@ -308,17 +309,18 @@ def make_temple(num_gaussians: int = 1_350_487, *, seed: int = 0, sh_degree: int
     """Make a Doric temple of 6 x 11 columns.
 
     Args:
-        num_gaussians: Exact number of gaussians; the default is that of the V3DG
-            paper's temple. From about 50,000 on it is recognisable.
+        num_gaussians: Exact number of gaussians; the default is the number of the V3DG
+            paper's temple. The temple is recognisable from about 50,000 on.
         seed: Each seed gives different weathering and plants.
         sh_degree: 0 to 3.
 
     Returns:
-        NumPy gaussians; z is up, the ground is at z = 0, the origin is below the
-        middle; lengths in metres: 15 x 27, 10 high.
+        Gaussians with NumPy arrays, in metres. The temple measures 15 x 27 and is 10
+        high; z is up, the ground is at z = 0, and the origin is below the middle.
 
     Raises:
-        ValueError: ``num_gaussians`` is below 5,000: there are about a thousand faces.
+        ValueError: ``num_gaussians`` is below 5,000; the temple has about a thousand
+            faces.
     """
     if num_gaussians < 5000:
         raise ValueError(f"num_gaussians: expected at least 5000, got {num_gaussians}")
@@ -343,7 +345,8 @@ def make_temple(num_gaussians: int = 1_350_487, *, seed: int = 0, sh_degree: int
 def _stone(
     material: str, patches: list[tuple[Patch, float]], noise: Noise, rng: np.random.Generator
 ) -> Part:
-    """Return gaussians that cover patches of one material, worn and coloured."""
+    """Return gaussians that cover the patches of one material, with worn edges and
+    colours."""
     points, normals, tangents, room = (
         np.concatenate([getattr(patch, name) for patch, _ in patches])
         for name in ("points", "normals", "tangents", "room")
@@ -378,7 +381,8 @@ def _stone(
 def _material_colour(material: str, points: Array, noise: Noise) -> Array:
     grain = noise(points, 9.0)
     if material == "tile":
-        each = noise(np.round(points * [1.2, 1.55, 1.2]) * 7.7, 1.0, 1)  # a shade for each tile
+        # A separate shade for each tile.
+        each = noise(np.round(points * [1.2, 1.55, 1.2]) * 7.7, 1.0, 1)
         return mix([0.36, 0.11, 0.045], [0.72, 0.31, 0.14], np.clip(0.7 * each + 0.5 * grain, 0, 1))
     if material == "wood":
         return mix([0.05, 0.028, 0.014], [0.16, 0.09, 0.045], noise(points * [6, 0.6, 6], 1.0))
@@ -391,8 +395,8 @@ def _material_colour(material: str, points: Array, noise: Noise) -> Array:
 
 
 def _joints(material: str, points: Array, normals: Array, noise: Noise) -> Array:
-    """Return the brightness of the joints, and that of each stone: courses on walls,
-    slabs on floors, drums of columns."""
+    """Return factors of the brightness: dark joints, and a shade for each stone. Stones
+    are courses of walls, slabs of floors and drums of columns."""
     x, y, z = points.T
     if material == "column":
         return 1 - 0.55 * smoothstep(0.02, 0.005, _to_joint(z - _FLOOR, _SHAFT / 5))
@@ -411,8 +415,8 @@ def _joints(material: str, points: Array, normals: Array, noise: Noise) -> Array
 
 
 def _weathered(material: str, points: Array, normals: Array, colour: Array, noise: Noise) -> Array:
-    """Return colours with dark streaks of rain below ledges, and lichen on flat
-    parts."""
+    """Return the colours with dark streaks of rain below ledges, and with lichen on
+    flat parts."""
     if material == "wood":
         return colour
     streak = noise(points * [1.0, 1.0, 0.07] + 17, 2.4) * noise(points + 57, 0.6)
@@ -427,12 +431,13 @@ def _weathered(material: str, points: Array, normals: Array, colour: Array, nois
 
 
 def _to_joint(x: Array, length: float) -> Array:
-    """Return the distance to the nearest joint between blocks of one length."""
+    """Return the distance to the nearest joint between blocks of the same length."""
     return np.asarray(np.abs(x / length - np.round(x / length)) * length)
 
 
 def _grass(n: int, rng: np.random.Generator) -> Part:
-    """Return blades of grass in the corners of the steps and around the base."""
+    """Return blades of grass in the corners of the steps and around the base of the
+    temple."""
     rows = 6
     k = max(n // rows, 1)
     step = rng.integers(0, 3, k)
@@ -444,7 +449,7 @@ def _grass(n: int, rng: np.random.Generator) -> Part:
         + (step == 0) * rng.exponential(0.12, k)
     )
     half = np.stack([_HALF_X + out, _HALF_Y + out], -1)
-    # Tufts are many blades near a few points of the rectangle's edge.
+    # A tuft is many blades near one point of the rectangle's edge.
     tuft = rng.random(max(k // 45, 1))
     place = (tuft[rng.integers(len(tuft), size=k)] + 0.0025 * rng.standard_normal(k)) % 1.0
     side, along = (4 * place).astype(int), 2 * ((4 * place) % 1.0) - 1
@@ -473,12 +478,13 @@ def _grass(n: int, rng: np.random.Generator) -> Part:
 
 
 def _ivy(n: int, noise: Noise, rng: np.random.Generator) -> Part:
-    """Return leaves that climb from the ground up the columns of one corner and over
-    the beams."""
+    """Return leaves of ivy that climb from the ground up the columns at one corner, and
+    over the beams."""
     rows, columns = 3, 2
     k = max(n // (rows * columns), 1)
     many = 6 * k
-    which = rng.integers(0, 5, many)  # columns along one side, from a corner
+    # Indices of columns along one side, counted from the corner.
+    which = rng.integers(0, 5, many)
     foot = np.stack([np.full(many, _HALF_X), -_HALF_Y + which * _PITCH], -1)
     angle = rng.uniform(0, 2 * np.pi, many)
     z = _FLOOR + (_SHAFT + 0.5) * rng.random(many)

@@ -1,12 +1,12 @@
-"""A 3DGS asset that needs no download: toadstools on a mossy tuft, and a meadow to
-place it in.
+"""A 3DGS asset that needs no download: toadstools on a mossy tuft, and a meadow of such
+tufts.
 
-The gaussians are distributed as after training: thin discs cover surfaces, needles
-follow blades of grass, sizes and opacities vary widely, and colour depends on the view
-where something is glossy or translucent. Light is simulated only as far as it makes a
-pleasant picture: one sun with soft shadows, a sky, some occlusion.
+The gaussians are distributed as in trained assets: thin discs cover surfaces, needles
+follow blades of grass, sizes and opacities vary widely, and the colours of glossy and
+translucent parts depend on the view. The simulation of light is simple: one sun with
+soft shadows, a sky, and some occlusion.
 
-z is up, the ground is near z = 0, the tuft's radius is about 1.
+z is up, the ground is near z = 0, and the radius of the tuft is about 1.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ def _discs(
     opacity: float = 2.2,
     overlap: float = 0.75,
 ) -> Part:
-    """Return thin discs that together cover a surface with points at distances of
+    """Return thin discs that together cover a surface, from points at distances of
     ``spacing``.
 
-    ``stretch`` lengthens them along their tangents at equal area; ``opacity`` is the
-    middle of the distribution of logits, of which a sixth is much fainter, as after
-    training.
+    ``stretch`` lengthens the discs along their tangents and preserves their area.
+    ``opacity`` is the middle of the distribution of logits. A sixth of the discs is
+    much fainter, as after training.
     """
     n = len(points)
     size = overlap * spacing * np.exp(0.22 * rng.standard_normal(n))
@@ -76,17 +76,17 @@ def _discs(
 
 
 def _ground_height(points: Array, noise: Noise) -> Array:
-    """Return the height of the tuft's soil at a point: a low mound that falls at its
-    rim."""
+    """Return the height of the tuft's soil at points: a low mound that falls towards
+    its rim."""
     r = np.hypot(points[:, 0], points[:, 1])
     flat = np.stack([points[:, 0], points[:, 1], np.zeros(len(points))], -1)
     return 0.13 * (1 - r**2) + 0.07 * (noise(flat, 2.5, 2) - 0.5) - 0.03 * smoothstep(0.85, 1.05, r)
 
 
 def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
-    """Return moss: a closed layer of discs with a fur of needles."""
+    """Return moss: a closed layer of discs, covered by a fur of needles."""
     n_base = n // 3
-    # Extends under the neighbours' rims.
+    # The layer extends below the rims of neighbouring tufts.
     disc = revolve(lambda t: (1.18 * t, np.zeros_like(t)), n_base)
     points = disc.points.copy()
     points[:, 2] = _ground_height(points, noise)
@@ -112,7 +112,8 @@ def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     root = np.stack([r * np.cos(a), r * np.sin(a), np.zeros(n_fur)], -1)
     root[:, 2] = _ground_height(root, noise)
     grow = unit(UP + 0.75 * rng.standard_normal((n_fur, 3)))
-    # Moss grows in cushions: long in the middle of one, short between two.
+    # Moss grows in cushions: its needles are long in the middle of a cushion and short
+    # between cushions.
     cushion = noise(root, 7.0, 2)
     size = 0.022 * np.sqrt(30000 / max(n_fur, 1)) ** 0.5 * (0.55 + 0.9 * cushion)
     height = rng.random(n_fur) * (0.01 + 0.08 * cushion**2)
@@ -138,19 +139,19 @@ def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 @dataclass
 class _Toadstool:
-    """The position and shape of a toadstool. Lengths are relative to the tuft's
-    radius."""
+    """The position and shape of a toadstool. The unit of length is the radius of the
+    tuft."""
 
     foot: Array  # (3,)
-    lean: Array  # (3,3)
+    lean: Array  # (3,3) rotation of the leaning toadstool
     height: float
-    radius: float  # of the cap
+    radius: float  # radius of the cap
     dome: float  # height of the cap relative to its radius
-    size: float  # fraction of the toadstools' gaussians
+    size: float  # fraction of all toadstools' gaussians
 
     @property
     def cap(self) -> Array:
-        """The centre of the cap's rim."""
+        """The centre of the rim of the cap."""
         centre: Array = self.foot + self.lean @ np.array([0, 0, self.height])
         return centre
 
@@ -160,11 +161,13 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     offset = rng.uniform(0, 30, 3)
 
     def cap_profile(t: Array) -> tuple[Array, Array]:
-        a = t * 1.78  # radians: beyond the rim at pi/2, the edge turns inwards
+        # Radians; the rim is at pi/2, and the edge beyond it turns inwards.
+        a = t * 1.78
         return radius * np.sin(a) ** 0.92, dome * np.cos(a) * np.where(a > np.pi / 2, 0.45, 1.0)
 
     def wobble(points: Array) -> Array:
-        """Deform points irregularly: the cap is not exactly round and its rim waves."""
+        """Deform points of the cap irregularly: the cap is not exactly round, and its
+        rim is wavy."""
         a = np.arctan2(points[:, 1], points[:, 0])
         r = np.hypot(points[:, 0], points[:, 1]) / radius
         wave = (
@@ -192,11 +195,11 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     skin = _discs(
         wobble(cap.points), cap.normals, meridian, cap.spacing, red, rng, stretch=1.5, gloss=1.0
     )
-    # A clean edge without a fringe.
+    # Gaussians near the rim are shortened, so that the edge has no fringe.
     skin.scales[:, 0] *= 1 - 0.45 * smoothstep(0.85, 1.0, cap.along)
     parts = [skin]
 
-    # Warts are remains of the veil: large near the top, small crumbs near the rim.
+    # Warts are large near the top of the cap, and small crumbs near its rim.
     count = max(8, int(40 * min(1.0, n / 4000) ** 0.5))
     on_cap = revolve(lambda t: cap_profile(0.03 + 0.80 * t), count)
     spots = wobble(on_cap.points)
@@ -224,7 +227,7 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
         wart = discs.moved(frame, spot - 0.1 * size * normal)
         parts.append(wart)
 
-    # Gills: the underside, in narrow bright and dark rays.
+    # The underside of the cap has gills: narrow rays, alternately bright and dark.
     gill = revolve(
         lambda t: (radius * (0.12 + 0.82 * t), 0.10 * dome * (1 - t) ** 2 - 0.05 * dome), n_gills
     )
@@ -240,10 +243,10 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
             stretch=5.0,
         )
     )
-    parts[-1].scales[:, 0] *= 1 - 0.75 * gill.along**4  # none extends beyond the rim
+    parts[-1].scales[:, 0] *= 1 - 0.75 * gill.along**4  # no gill extends beyond the rim
     parts[-1].occlusion[:] = 0.45 + 0.30 * gill.along
 
-    # Stem: a fibrous column with a bulb, rings of scales on it.
+    # The stem is a fibrous column with a bulb and rings of scales.
     def stem_profile(t: Array) -> tuple[Array, Array]:
         z = 1 - t
         bulb = 0.55 * np.exp(-(((z - 0.10) / 0.13) ** 2)) + 0.10 * np.sin(38 * z) * np.exp(
@@ -262,7 +265,7 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     part.occlusion[:] = 0.55 + 0.45 * smoothstep(0, 0.3, stem.points[:, 2] / height)
     parts.append(part)
 
-    # Skirt: a thin torn veil around the stem.
+    # The skirt is a thin torn veil around the stem.
     skirt = revolve(
         lambda t: (radius * (0.20 + 0.19 * t**0.8), height * (0.80 - 0.13 * t**1.3)), n_skirt
     )
@@ -284,7 +287,7 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     )
     parts.append(veil)
 
-    # The cap is on the stem; everything leans together.
+    # The cap is moved onto the stem before the whole toadstool leans.
     for i in range(len(parts) - 2):
         parts[i].means[:, 2] += height
     whole = Part.concatenate(parts)
@@ -292,7 +295,7 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
 
 
 def _on_ground(n: int, noise: Noise, rng: np.random.Generator, low: float, high: float) -> Array:
-    """Return random positions on the ground between two radii."""
+    """Return random positions on the ground between two distances from the centre."""
     r = np.sqrt(rng.uniform(low**2, high**2, n))
     a = np.arange(n) * GOLDEN_ANGLE + rng.uniform(0, 2 * np.pi) + 0.5 * rng.standard_normal(n)
     points = np.stack([r * np.cos(a), r * np.sin(a), np.zeros(n)], -1)
@@ -337,17 +340,17 @@ def _grass(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 @dataclass
 class _Flower:
-    """A kind of flower; lengths relative to the tuft's radius."""
+    """A kind of flower. The unit of length is the radius of the tuft."""
 
     petals: int
-    rows: int  # gaussians along a petal
-    columns: int  # and across it
-    heart: int  # gaussians in the yellow dome
-    stalk: int  # and along the stalk
-    size: float  # of a petal
+    rows: int  # number of gaussians along a petal
+    columns: int  # number of gaussians across a petal
+    heart: int  # number of gaussians in the yellow dome
+    stalk: int  # number of gaussians along the stalk
+    size: float  # length of a petal
     slim: float  # half width of a petal relative to its length
     low: float
-    high: float  # height of the stalk
+    high: float  # range of the stalk's height, from `low` to `high`
     petal: tuple[float, float, float]
     tip: tuple[float, float, float]
 
@@ -426,7 +429,7 @@ def _stalks(base: Array, head: Array, width: float, rows: int, rng: np.random.Ge
     length, widths = np.linalg.norm(toward, axis=1), np.full(k, width)
     part, t, _ = strips(base, toward, up, length, widths, np.zeros(k), rows, 1, np.ones_like, rng)
     part.albedo = mix([0.05, 0.11, 0.02], [0.20, 0.36, 0.07], t)
-    part.scales[:, 2] = part.scales[:, 1]  # round, not flat
+    part.scales[:, 2] = part.scales[:, 1]  # makes the gaussians round, not flat
     part.occlusion = 0.4 + 0.6 * t
     return part
 
@@ -493,8 +496,8 @@ def _pebbles(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 
 def _shadow(points: Array, caps: Sequence[_Toadstool]) -> Array:
-    """Return the fraction of the sun that caps let through to each point: caps are
-    ellipsoids with soft edges."""
+    """Return (n,) the fraction of the sun's light that caps let through to points. Caps
+    are ellipsoids with soft edges here."""
     light = np.ones(len(points))
     for shape in caps:
         axes = np.array([1, 1, shape.dome]) * shape.radius
@@ -506,7 +509,7 @@ def _shadow(points: Array, caps: Sequence[_Toadstool]) -> Array:
 
 
 def _under_caps(points: Array, caps: Sequence[_Toadstool]) -> Array:
-    """Return the fraction of the sky that caps leave free above each point."""
+    """Return (n,) the fraction of the sky above points that caps do not cover."""
     free = np.ones(len(points))
     for shape in caps:
         aside = np.hypot(*(points - shape.cap)[:, :2].T) / shape.radius
@@ -520,8 +523,8 @@ def _under_caps(points: Array, caps: Sequence[_Toadstool]) -> Array:
 
 
 def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
-    """Compute the light on the gaussians; return their colours as spherical harmonics
-    of degree 1, (n,4,3)."""
+    """Compute the light on gaussians; return their colours as spherical harmonics of
+    degree 1, (n,4,3)."""
     facing = part.normals @ TO_SUN
     thin = part.translucency
     sunlit = _shadow(part.means, caps)
@@ -535,16 +538,17 @@ def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
     linear = part.albedo * (direct[:, None] * SUN + sky[:, None] * SKY + bounce)
     colour = display(linear)
 
-    # The view-dependent part is linear in the direction v to the eye: the sky's
-    # reflection is brighter the higher the reflected direction 2 (n.v) n - v points;
-    # the sun's highlight is towards the sun's reflected direction; thin parts glow if
-    # the sun is behind them.
+    # The view-dependent part is linear in the direction v to the eye. The reflection of
+    # the sky is brighter if the reflected direction 2 (n.v) n - v points higher; the
+    # sun's highlight is brighter towards the sun's reflected direction; and thin parts
+    # glow if the sun is behind them.
     n = part.normals
     shine = part.gloss[:, None]
     mirrored_sky = 2 * n[:, 2:] * n - UP
     mirrored_sun = 2 * np.maximum(facing, 0)[:, None] * n - TO_SUN
     highlight = (sunlit * smoothstep(0.35, 0.95, facing))[:, None]
-    white = shine * (0.05 * mirrored_sky + 0.42 * highlight * mirrored_sun)  # (n,3): weight of v
+    # (n,3) factors of v.
+    white = shine * (0.05 * mirrored_sky + 0.42 * highlight * mirrored_sun)
     glow = (thin * sunlit * part.occlusion)[:, None] * -0.22 * TO_SUN
     tint = colour / np.maximum(colour.max(1, keepdims=True), 1e-3)
     gradient = (
@@ -554,8 +558,8 @@ def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
 
     sh = np.empty((len(n), 4, 3))
     sh[:, 0] = (colour - 0.5) / SH_C0
-    # The basis functions of degree 1 are -y, z, -x of the direction from the eye, which
-    # is -v.
+    # The spherical harmonics of degree 1 are proportional to -y, z and -x of the
+    # direction from the eye, which is -v.
     sh[:, 1] = gradient[:, 1] / SH_C1
     sh[:, 2] = -gradient[:, 2] / SH_C1
     sh[:, 3] = gradient[:, 0] / SH_C1
@@ -566,12 +570,13 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
     """Make a tuft of moss with toadstools, grass, daisies, clover and pebbles.
 
     Args:
-        num_gaussians: Exact number of gaussians; with fewer, there are fewer blades and
-            larger gaussians. From about 10,000 on the asset is recognisable. seed: The
-            same seed gives the same gaussians.
+        num_gaussians: Exact number of gaussians. Smaller numbers give fewer blades and
+            larger gaussians; the asset is recognisable from about 10,000 on.
+        seed: The same seed gives the same gaussians.
 
     Returns:
-        NumPy gaussians with SH degree 1; z is up, the ground's radius is about 1.
+        Gaussians with NumPy arrays and SH degree 1; z is up, and the radius of the
+        ground is about 1.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
@@ -604,7 +609,7 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
     rest = n - sum(len(p.means) for p in parts)
     parts.append(_ground(rest, noise, rng))
     whole = Part.concatenate(parts)
-    order = rng.permutation(n)  # files of trained assets have no order either
+    order = rng.permutation(n)  # files of trained assets have no order, either
     return Gaussians(
         means=whole.means[order].astype(np.float32),
         quats=quaternions(whole.tangents, whole.normals)[order].astype(np.float32),
@@ -615,14 +620,15 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
 
 
 def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Array]:
-    """Place tufts on a round hill, close enough that moss covers it, each with a
-    different rotation and size.
+    """Place tufts on a round hill, so close that moss covers it, each with a different
+    rotation and size.
 
-    The first tuft is at the origin, upright. Toadstools of two tufts rarely touch.
+    The first tuft is at the origin and upright. Toadstools of different tufts rarely
+    touch.
 
     Returns:
-        Positions (count,3), quaternions (count,4) w,x,y,z and scales (count,), float64;
-        from the middle outwards.
+        Positions (count,3), quaternions (count,4) w,x,y,z and scales (count,), as
+        float64 and from the middle outwards.
 
     Raises:
         ValueError: ``count`` is below 1.
@@ -630,7 +636,8 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Arra
     if count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")
     rng = np.random.default_rng(seed)
-    spacing = 1.68  # of a hexagonal grid: discs of radius 1 cover the plane up to 1.73
+    # Pitch of a hexagonal grid; up to 1.73, discs of radius 1 cover the plane.
+    spacing = 1.68
     reach = int(np.ceil(np.sqrt(count))) + 2
     i, j = (
         x.ravel() for x in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
@@ -641,7 +648,8 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Arra
 
     rim = spacing * np.sqrt(max(count, 7) * np.sqrt(0.75) / np.pi)
     waves = rng.uniform(0, 2 * np.pi, (2, 3))
-    pitch = np.array([[0.23, 0.11], [-0.13, 0.27], [0.31, -0.19]])  # rad per unit of length
+    # Radians per unit of length.
+    pitch = np.array([[0.23, 0.11], [-0.13, 0.27], [0.31, -0.19]])
     phase = plane @ pitch.T + waves[0]
     origin = np.sin(waves[0]).sum()
     swell = 0.30

@@ -1,5 +1,5 @@
-"""Trees of eight kinds: a trunk that branches in levels, bark, and thin leaves that
-light passes through."""
+"""Trees of eight kinds, with a trunk that branches in levels, bark, and thin leaves
+through which light passes."""
 
 from __future__ import annotations
 
@@ -24,41 +24,42 @@ from benchmarks.worlds.procedural._parts import (
 )
 from v3dg.gaussians import Gaussians
 
-_STEPS = 10  # segments of a branch
-_CLEARANCE = 0.3  # m; branches do not come closer to the ground
+_STEPS = 10  # number of segments of a branch
+_CLEARANCE = 0.3  # metres; branches keep at least this distance from the ground
 _LEAF_ROWS, _LEAF_COLUMNS = 3, 2
 
 
 @dataclass(frozen=True)
 class _Level:
-    """How branches of one level grow from those of the level below."""
+    """The growth of branches of one level from the branches of the previous level."""
 
-    children: int  # number on each branch
-    start: float  # position of the first child along the parent, in [0,1]
-    # Angle to the parent's direction, radians: of the first child and of the last.
+    children: int  # number of children of each branch
+    start: float  # position of the first child on its parent, in [0,1]
+    # Angles in radians to the parent's direction, of the first and of the last child.
     angle: tuple[float, float]
-    # Relative to the parent's length: of the first child and of the last.
+    # Lengths relative to the parent's, of the first and of the last child.
     length: tuple[float, float]
-    bulge: float  # how much longer children in the middle are
-    wander: float  # how crooked
-    rise: float  # bends upwards; negative: droops
+    bulge: float  # additional relative length of children in the middle
+    wander: float  # strength of random bends
+    rise: float  # strength of the bend upwards; a negative value bends downwards
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of tree; lengths in metres."""
+    """The properties of a kind of tree. Lengths are in metres."""
 
-    height: float  # of the trunk
+    height: float  # height of the trunk
     girth: float  # radius of the trunk at breast height
     trunk: _Level
     levels: tuple[_Level, ...]
     bark: tuple[tuple[float, float, float], tuple[float, float, float]]
-    leaf: tuple[float, float]  # length and half width, at the default count
-    # Two colours, between which a tree's leaves vary.
+    # Length and half width at the default number of gaussians.
+    leaf: tuple[float, float]
+    # Two colours; the colours of leaves vary between them.
     leaves: tuple[tuple[float, float, float], ...]
-    hang: float = 0.3  # how much leaves hang
+    hang: float = 0.3  # how strongly leaves hang down
     needles: bool = False
-    bands: float = 0.0  # dark stripes across the bark, as birches have
+    bands: float = 0.0  # strength of dark stripes across the bark, as on birches
 
 
 def _straight(wander: float = 0.03) -> _Level:
@@ -188,7 +189,7 @@ TREE_KINDS: tuple[str, ...] = tuple(_KINDS)
 
 @dataclass
 class _Branches:
-    """B branches as polylines of _STEPS segments."""
+    """B branches as polylines with _STEPS segments."""
 
     points: Array  # (B,_STEPS+1,3)
     lengths: Array  # (B,)
@@ -203,7 +204,7 @@ def _grow(
     level: _Level,
     rng: np.random.Generator,
 ) -> _Branches:
-    """Return crooked branches that grow from ``base`` and taper to a quarter of their
+    """Return crooked branches that start at ``base`` and taper to a quarter of their
     first radius."""
     points = np.empty((len(base), _STEPS + 1, 3))
     points[:, 0], heading = base, unit(direction)
@@ -218,7 +219,7 @@ def _grow(
 
 
 def _at(branches: _Branches, which: NDArray[np.int64], t: Array) -> tuple[Array, Array, Array]:
-    """Return points, directions and radii at ``t`` in [0,1] along branches."""
+    """Return points, directions and radii of branches at positions ``t`` in [0,1]."""
     place = np.clip(t, 0, 1 - 1e-9) * _STEPS
     i = place.astype(np.int64)
     f = (place - i)[:, None]
@@ -228,7 +229,8 @@ def _at(branches: _Branches, which: NDArray[np.int64], t: Array) -> tuple[Array,
 
 
 def _branch_out(parents: _Branches, level: _Level, rng: np.random.Generator) -> _Branches:
-    """Return the children of every branch, in a spiral around it."""
+    """Return the children of all branches, which are placed in a spiral around each
+    branch."""
     count, k = len(parents.lengths), level.children
     which = np.repeat(np.arange(count), k)
     share = np.tile((np.arange(k) + 0.5) / k, count) + rng.uniform(-0.4, 0.4, count * k) / k
@@ -258,21 +260,22 @@ def _branch_out(parents: _Branches, level: _Level, rng: np.random.Generator) -> 
 def make_tree(
     num_gaussians: int = 315_630, *, kind: str = "oak", seed: int = 0, sh_degree: int = 1
 ) -> Gaussians:
-    """Make a tree: bark on branches of four levels, leaves or needles on the last.
+    """Make a tree with bark on branches of four levels, and leaves or needles on the
+    outer branches.
 
     Args:
         num_gaussians: Exact number of gaussians; the default is the mean of the V3DG
-            paper's trees. With fewer, there are fewer and larger leaves.
+            paper's trees. Smaller numbers give fewer and larger leaves.
         kind: One of ``TREE_KINDS``.
         seed: Each seed gives another tree of the same kind.
-        sh_degree: 0 to 3; from 1 on leaves glow if the sun is behind them.
+        sh_degree: 0 to 3; from degree 1 on, leaves glow if the sun is behind them.
 
     Returns:
-        NumPy gaussians; z is up, the foot of the trunk is at the origin; lengths in
-        metres.
+        Gaussians with NumPy arrays, in metres; z is up, and the foot of the trunk is at
+        the origin.
 
     Raises:
-        ValueError: ``num_gaussians`` is below 1,000, or there is no such kind.
+        ValueError: ``num_gaussians`` is below 1,000, or ``kind`` is unknown.
     """
     if num_gaussians < 1000:
         raise ValueError(f"num_gaussians: expected at least 1000, got {num_gaussians}")
@@ -304,16 +307,16 @@ def make_tree(
 def _bark(
     levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.random.Generator
 ) -> Part:
-    """Return n gaussians around all branches: flat ones on thick branches, needles
-    along thin ones."""
+    """Return n gaussians of bark on all branches: flat ones on thick branches, needles
+    along thin branches."""
     start = np.concatenate([b.points[:, :-1].reshape(-1, 3) for b in levels])
     end = np.concatenate([b.points[:, 1:].reshape(-1, 3) for b in levels])
     r0 = np.concatenate([b.radii[:, :-1].ravel() for b in levels])
     r1 = np.concatenate([b.radii[:, 1:].ravel() for b in levels])
     length = np.linalg.norm(end - start, axis=1)
     area = 2 * np.pi * 0.5 * (r0 + r1) * length
-    # Thin branches get more than in proportion to their area; otherwise they would have
-    # too few to be visible.
+    # Thin branches get more gaussians than their area requires; otherwise they would
+    # have too few to be visible.
     which = allot(area**0.78, n, rng)
     here = np.bincount(which, minlength=len(area))[which]
     t, angle = rng.random(n), rng.uniform(0, 2 * np.pi, n)
@@ -325,7 +328,8 @@ def _bark(
     foot = np.exp(-np.maximum(centre[:, 2], 0) / 0.35) * (radius > 0.3 * shape.girth)
     ribs = 0.5 + 0.5 * np.sin(5 * angle + 2.0)
     radius = radius * (1 + foot * (0.35 + 0.55 * ribs))
-    squeezed = (centre + normal * radius[:, None]) * [1.0, 1.0, 0.22]  # furrows run along the trunk
+    # Furrows run along the trunk.
+    squeezed = (centre + normal * radius[:, None]) * [1.0, 1.0, 0.22]
     furrow = noise(squeezed, 14.0) + 0.35 * (noise(squeezed + 5, 60.0, 2) - 0.5)
     thick = np.minimum(radius / 0.05, 1)
     points = centre + normal * (radius * (1 + 0.16 * thick * (furrow - 0.5)))[:, None]
@@ -346,17 +350,19 @@ def _bark(
         spacing,
         colour,
         rng,
-        aligned=0.5 if shape.bands else 0.8,  # bands would blur along the trunk
+        # Otherwise the bands would blur along the trunk.
+        aligned=0.5 if shape.bands else 0.8,
         bend=radius,
     )
-    # A branch thinner than its gaussians are apart is drawn by needles along its axis.
+    # A branch that is thinner than the distance between its gaussians consists of
+    # needles along its axis.
     limit = 0.30 * radius
     part.scales[:, 1] = np.minimum(part.scales[:, 1], np.maximum(limit, 0.0015))
     part.scales[:, 2] = np.minimum(part.scales[:, 2], part.scales[:, 1])
     part.scales[:, 0] = np.clip(
         part.scales[:, 0], part.scales[:, 1], np.maximum(0.30 * length[which], 0.002)
     )
-    above = np.maximum(points[:, 2], 0)  # none reaches far below the ground
+    above = np.maximum(points[:, 2], 0)  # no gaussian is far below the ground
     part.scales[:, 0] = np.minimum(
         part.scales[:, 0], np.maximum(0.3 * above + 0.02, part.scales[:, 1])
     )
@@ -366,8 +372,8 @@ def _bark(
 def _seats(
     levels: list[_Branches], k: int, rng: np.random.Generator
 ) -> tuple[Array, Array, NDArray[np.int64]]:
-    """k places on the outer branches, in proportion to length, their directions, and
-    which they are."""
+    """Return k random positions on the outer branches, with a density per length, and
+    the direction and the index of the branch at each position."""
     twigs, limbs = levels[-1], levels[-2]
     points = np.concatenate([twigs.points, limbs.points])
     lengths = np.concatenate([twigs.lengths, 0.4 * limbs.lengths])
@@ -380,7 +386,7 @@ def _seats(
 
 
 def _leaf_colours(shape: _Kind, twigs: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Return a colour for each leaf; leaves of one twig are alike."""
+    """Return a colour for each leaf. Leaves of one twig have similar colours."""
     k = len(twigs)
     of_twig = rng.random(int(twigs.max(initial=0)) + 1)[twigs]
     x = np.clip(0.5 * of_twig + 0.5 * rng.random(k) + 0.10 * rng.standard_normal(k), 0, 1)
@@ -393,12 +399,13 @@ def _leaves(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Genera
     each = _LEAF_ROWS * _LEAF_COLUMNS
     k = n // each
     place, along, which = _seats(levels, k, rng)
-    # Fewer leaves are larger, though less so than would keep their area.
+    # Fewer leaves are larger, but they do not preserve the total area.
     grown = (41_000 / k) ** 0.38
     out = unit(along + 0.75 * rng.standard_normal((k, 3)) - shape.hang * UP)
     face = unit(0.9 * UP + 0.75 * rng.standard_normal((k, 3)))
     length = shape.leaf[0] * grown * np.exp(0.22 * rng.standard_normal(k))
-    place[:, 2] = np.maximum(place[:, 2], 1.3 * length)  # the lowest hang just above the ground
+    # The lowest leaves hang just above the ground.
+    place[:, 2] = np.maximum(place[:, 2], 1.3 * length)
     part, t, s = strips(
         place + 0.15 * out * length[:, None],
         out,
@@ -413,8 +420,8 @@ def _leaves(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Genera
     )
     part.albedo = np.repeat(_leaf_colours(shape, which, rng), each, axis=0)
     part.albedo *= (1.12 - 0.25 * np.abs(s))[:, None]
-    # The rim lets the background through, and training leaves some much fainter than
-    # others.
+    # The rims of leaves let the background through, and some leaves are much fainter,
+    # as after training.
     logits = (
         np.log(part.opacities / (1 - part.opacities))
         - 1.2 * t * t
@@ -429,7 +436,7 @@ def _leaves(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Genera
 
 
 def _needles(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Generator) -> Part:
-    """One gaussian a needle."""
+    """Return needles, a gaussian for each."""
     place, along, which = _seats(levels, n, rng)
     grown = (250_000 / n) ** 0.38
     aside = unit(np.cross(along, rng.standard_normal((n, 3))))

@@ -28,8 +28,8 @@ def median_split(device, means, cluster_size):
     return split_segments(device, means, np.array([0, len(means)]), depth)
 
 
-def split_segments(device, means, offset, depth):
-    order, leaf_offset = _core.median_split(on(device, means), offset, depth)
+def split_segments(device, means, offset, depth, unit=1):
+    order, leaf_offset = _core.median_split(on(device, means), offset, depth, unit)
     return host(order), leaf_offset
 
 
@@ -61,6 +61,27 @@ def test_leaves_partition_the_points_evenly(device, num_points, cluster_size, se
         assert (np.diff(order[first:last]) > 0).all()
 
 
+@given(means=st.one_of(coarse_means, any_means), unit=st.integers(1, 9))
+def test_runs_agree_with_reference(device, means, unit):
+    depth = _core.num_halvings(-(-len(means) // unit), 1)
+    ends = np.array([0, len(means)])
+    order, leaf_offset = split_segments(device, means, ends, depth, unit)
+    runs = reference.runs(means, unit)
+    np.testing.assert_array_equal(order, [i for run in runs for i in run])
+    assert set(leaf_offset) == {0, *np.cumsum([len(run) for run in runs])}
+    # All runs but the last one are full, so each begins at a multiple of the unit.
+    assert all(len(run) == unit for run in runs[:-1])
+
+
+@given(means=st.one_of(coarse_means, any_means), unit=st.integers(1, 9))
+def test_points_in_runs_keep_their_order(device, means, unit):
+    depth = _core.num_halvings(-(-len(means) // unit), 1)
+    ends = np.array([0, len(means)])
+    order, _ = split_segments(device, means, ends, depth, unit)
+    again, _ = split_segments(device, means[order], ends, depth, unit)
+    np.testing.assert_array_equal(again, np.arange(len(means)))
+
+
 def test_identical_points_split_by_index(device):
     order, leaf_offset = median_split(device, np.ones((10, 3), np.float32), 3)
     np.testing.assert_array_equal(order, np.arange(10))
@@ -78,16 +99,17 @@ def test_large_split_agrees_with_itself_moved(device):
 @given(
     lengths=st.lists(st.integers(0, 40), max_size=6),
     depth=st.integers(0, 5),
+    unit=st.integers(1, 9),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_segments_split_as_if_alone(device, lengths, depth, seed):
+def test_segments_split_as_if_alone(device, lengths, depth, unit, seed):
     offset = np.cumsum([0, *lengths])
     means = np.random.default_rng(seed).integers(-3, 3, size=(offset[-1], 3)).astype(np.float32)
-    order, leaf_offset = split_segments(device, means, offset, depth)
+    order, leaf_offset = split_segments(device, means, offset, depth, unit)
     assert len(leaf_offset) == len(lengths) * 2**depth + 1
     for s, (first, last) in enumerate(itertools.pairwise(offset)):
         alone, alone_offset = split_segments(
-            "cpu", means[first:last], np.array([0, last - first]), depth
+            "cpu", means[first:last], np.array([0, last - first]), depth, unit
         )
         np.testing.assert_array_equal(order[first:last], first + alone)
         np.testing.assert_array_equal(
@@ -104,6 +126,7 @@ def test_large_splits_are_the_same_on_both_devices(decimals):
     for split, argument in (
         (median_split, (100,)),
         (split_segments, (np.arange(0, 150_001, 300), 3)),
+        (split_segments, (np.arange(0, 150_001, 250), 3, 32)),
     ):
         for got, expected in zip(
             split("cuda", means, *argument), split("cpu", means, *argument), strict=True
@@ -124,6 +147,11 @@ def test_large_splits_are_the_same_on_both_devices(decimals):
 def test_split_refuses_bad_input(means, cluster_size, message):
     with pytest.raises(ValueError, match=message):
         median_split("cpu", means, cluster_size)
+
+
+def test_split_refuses_bad_unit():
+    with pytest.raises(ValueError, match="unit: expected at least 1, got 0"):
+        split_segments("cpu", np.zeros((4, 3), np.float32), np.array([0, 4]), 1, 0)
 
 
 @pytest.mark.parametrize("offset", [[0, 3], [1, 4], [0, 3, 2, 4], []])

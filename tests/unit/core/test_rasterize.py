@@ -244,7 +244,7 @@ def test_no_more_light_is_lost_than_asked_for(device, min_transmittance):
 def test_a_share_of_light_is_refused_that_is_none(value):
     camera = scenes.CAMERAS["plain"]
     with pytest.raises(
-        ValueError, match=r"min_transmittance: expected a share of light, 0 to 0\.99, got"
+        ValueError, match=r"min_transmittance: expected a transmittance from 0 to 0\.99, got"
     ):
         v3dg.render(
             scenes.trained_like(32, camera, 5), camera, min_transmittance=value, device="cpu"
@@ -416,7 +416,7 @@ def test_double_precision_stays_on_the_cpu(torch):
     double = v3dg.Gaussians(
         *(getattr(scenes.gaussians([0, 0, 1.0]).torch("cuda"), n).double() for n in scenes.NAMES)
     )
-    with pytest.raises(ValueError, match="float64 is computed on the CPU"):
+    with pytest.raises(ValueError, match="float64 is supported only on the CPU"):
         v3dg.rasterize(double, scenes.camera())
 
 

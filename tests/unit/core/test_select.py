@@ -386,9 +386,13 @@ def test_empty_and_smallest_scenes():
 def test_bad_arguments_are_refused():
     bundle = random_bundle(1)
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8)
-    with pytest.raises(ValueError, match=r"tolerance: expected 0 px² or more, got -1"):
+    with pytest.raises(
+        ValueError, match=r"tolerance: expected a number of px² of at least 0, got -1"
+    ):
         select(bundle, camera, tolerance=-1, device="cpu")
-    with pytest.raises(ValueError, match="tolerance: expected 0 px² or more, got nan"):
+    with pytest.raises(
+        ValueError, match="tolerance: expected a number of px² of at least 0, got nan"
+    ):
         select(bundle, camera, tolerance=float("nan"), device="cpu")
     with pytest.raises(
         ValueError, match="footprint: expected 'solid_angle' or 'paper', got 'ball'"

@@ -90,7 +90,7 @@ def test_budget_below_the_coarsest_cut_is_refused(device):
     with pytest.raises(ValueError, match=message):
         render(scene, camera, budget=least - 1, device=device).stats  # noqa: B018  waits for the picture
     with pytest.raises(
-        ValueError, match="budget: expected a whole number of gaussians, 0 or more, got -1"
+        ValueError, match="budget: expected a whole number of gaussians of at least 0, got -1"
     ):
         select(scene, camera, budget=-1, device="cpu")
 
@@ -142,7 +142,9 @@ def test_nothing_finer_than_the_least_level(device, min_level):
         for path in reference.paths(clusters, groups):
             assert len(mine.intersection(path)) == 1
     assert pairs(select(scene, camera, tolerance=0.0, min_level=min_level, device=device))
-    with pytest.raises(ValueError, match="min_level: expected a level, 0 or more, got -1"):
+    with pytest.raises(
+        ValueError, match="min_level: expected the index of a level, at least 0, got -1"
+    ):
         select(scene, camera, min_level=-1, device="cpu")
 
 
@@ -325,7 +327,7 @@ def test_cut_of_another_scene_is_refused(device):
     cut = select(scene, camera, device="cpu")
     with pytest.raises(ValueError, match="cut: expected a selection from this scene"):
         render(composed(rng), camera, cut=cut, device=device)
-    with pytest.raises(ValueError, match="budget: expected no value besides a cut"):
+    with pytest.raises(ValueError, match="budget: expected no value together with a cut"):
         render(scene, camera, cut=cut, budget=10**6, device=device)
     everything = select(scene, camera, cull=False, device="cpu")
     scene.remove(len(scene) - 1)

@@ -522,17 +522,19 @@ def test_what_has_no_weight_is_not_drawn(device):
 def test_fades_out_of_range_are_refused(fade):
     bundle = random_bundle(1)
     for draw in (select, render):
-        with pytest.raises(ValueError, match=r"fade: expected None or a factor of 1 to 1000, got"):
+        with pytest.raises(
+            ValueError, match=r"fade: expected None or a factor from 1 to 1000, got"
+        ):
             draw(bundle, CAMERA, fade=fade, device="cpu")
 
 
 def test_weights_that_are_none_are_refused():
     bundle, ids = random_bundle(1), np.zeros(1, np.int32)
     for weights in ([-0.1], [1.1], [np.nan], [0.5, 0.5]):
-        with pytest.raises(ValueError, match="given_weights: expected 1 numbers of 0 to 1, got"):
+        with pytest.raises(ValueError, match="given_weights: expected 1 numbers from 0 to 1, got"):
             Selection(Scene.of(bundle), ids, ids, 1, 0.0, 0.0, given_weights=np.float32(weights))
     for others in (["much"], [None], "much", [1j]):
-        with pytest.raises(ValueError, match="given_weights: expected 1 numbers of 0 to 1, got"):
+        with pytest.raises(ValueError, match="given_weights: expected 1 numbers from 0 to 1, got"):
             Selection(Scene.of(bundle), ids, ids, 1, 0.0, 0.0, given_weights=others)
 
 

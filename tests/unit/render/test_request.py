@@ -47,7 +47,7 @@ def test_wrong_numbers_are_named(arguments, message):
 def test_wrong_shades_are_named():
     with pytest.raises(ValueError, match="background: expected"):
         shade_of((0.25, 0.5), None, is_asset=False, depth=True)
-    with pytest.raises(ValueError, match="min_transmittance: expected a share of light"):
+    with pytest.raises(ValueError, match="min_transmittance: expected a transmittance from"):
         shade_of(BLACK, 1.0, is_asset=False, depth=True)
 
 

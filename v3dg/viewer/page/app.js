@@ -1,4 +1,4 @@
-// The page: its parts, what the server says to them, and what keys and buttons do.
+// The page: creates its parts, handles messages from the server, and acts on keys and buttons.
 
 import { Bookmarks } from "./bookmarks.js";
 import { Camera } from "./camera.js";
@@ -29,15 +29,13 @@ import { Toolbar } from "./toolbar.js";
 
 export class App {
   /**
-   * What the server said first; null until then.
+   * The first message of the server; null until it has arrived.
    *
    * @type {Hello}
    */
   greeting = null;
   /**
-   * What is shown; null until the server has said it.
-   *
-   * @type {Scene}
+   * The scene that is shown; null until the server has described it.
    */
   scene = null;
 
@@ -74,7 +72,7 @@ export class App {
     return this.greeting.limits;
   }
 
-  // What the server says.
+  // Messages from the server.
 
   /** @param {boolean} isOpen */
   changeConnection(isOpen) {
@@ -170,7 +168,7 @@ export class App {
     this.toolbar.showQuestion(false);
   }
 
-  // What is shown.
+  // The state of the page.
 
   resize() {
     const { clientWidth, clientHeight } = this.look.stage;
@@ -183,7 +181,7 @@ export class App {
     this.frames.redraw();
   }
 
-  /** Has all that is seen follow what was set. */
+  /** Updates everything on the page after a change of the state. */
   sync() {
     this.toolbar.sync();
     this.panel.sync();
@@ -196,7 +194,7 @@ export class App {
     this.sync();
   }
 
-  /** Lets go of the box of a crop, or of the selected instance. */
+  /** Ends the crop if there is one; otherwise deselects the instance. */
   letGo() {
     if (this.crop.isOn) this.crop.end();
     else this.instances.select(null);

@@ -1,4 +1,4 @@
-// Bookmarks: links to places of a scene, which the browser keeps.
+// Bookmarks: links to views of a scene, which the browser stores.
 
 /** @typedef {import("./app.js").App} App */
 /** @typedef {{ name: string, hash: string }} Bookmark */
@@ -12,12 +12,12 @@ export class Bookmarks {
     this.app = app;
   }
 
-  /** Name under which the browser keeps those of the scene. */
+  /** The key under which the browser stores the bookmarks of the scene. */
   get storageKey() {
     return `v3dg:${this.app.scene.name}`;
   }
 
-  /** Reads those of the scene; what is not readable is left out. */
+  /** Loads the bookmarks of the scene; unreadable ones are skipped. */
   load() {
     /** @type {Bookmark[]} */
     let saved = [];
@@ -35,18 +35,20 @@ export class Bookmarks {
     try {
       localStorage.setItem(this.storageKey, JSON.stringify(this.list));
     } catch {
-      this.app.status.warn("This browser keeps no bookmarks: they go with the tab.");
+      this.app.status.warn(
+        "This browser stores no bookmarks: they are lost when the tab is closed.",
+      );
     }
     this.app.sync();
   }
 
-  /** Adds one of what is looked at now, named after the camera's position. */
+  /** Adds a bookmark of the current view, named after the camera's position. */
   add() {
     const { app } = this;
     const name = app.camera.position.map((x) => Number(x.toPrecision(3))).join(" ");
     this.list.push({ name, hash: app.linkState.hash });
     this.save();
-    app.status.confirm(`Bookmark ${this.list.length} is kept.`);
+    app.status.confirm(`Bookmark ${this.list.length} was added.`);
   }
 
   /** @param {number} index */

@@ -1,4 +1,4 @@
-// The camera that the page looks from, and how it moves. Lengths are in the scene's units.
+// The camera of the page, and how it moves. Lengths are in world units.
 
 import * as M from "./math.js";
 
@@ -22,9 +22,9 @@ export const AXES = {
 export const MODES = ["orbit", "fly", "walk"];
 export const SPEED_BOUNDS = [0.01, 100];
 const FLIGHT_SECONDS = 0.6;
-/** Largest sine of the angle between what the camera looks at and the horizon. */
+/** Largest sine of the angle between the view direction and the horizon. */
 const STEEPEST = 0.998;
-/** Time in which the velocity follows a push, by a factor of e. */
+/** Time constant in seconds with which the velocity approaches the requested one. */
 const EASE_SECONDS = 0.07;
 
 /**
@@ -43,7 +43,7 @@ export class Camera {
   /** Vertical field of view, radians. */
   fov_y = Math.PI / 4;
   /**
-   * The point that orbits go around.
+   * The point around which the camera orbits.
    *
    * @type {Vector}
    */
@@ -52,22 +52,22 @@ export class Camera {
   up = [0, 0, 1];
   /** @type {Mode} */
   mode = MODES[0];
-  /** Factor of the pace that suits the scene. */
+  /** Factor of the speed that suits the scene. */
   speed = 1;
   /** Radius of the scene. */
   radius = 1;
   /**
-   * Distance to what is in the middle of the picture; null if not known.
+   * Distance to whatever is in the middle of the picture; null if unknown.
    *
    * @type {number}
    */
   ahead = null;
   /** @type {Vector} */
   velocity = [0, 0, 0];
-  /** Seconds for which the camera has been pushed against what is near. */
+  /** Time in seconds for which the user has been moving while an object is near. */
   pushedSeconds = 0;
   /**
-   * A flight to another view, and for how long it has gone on; null without one.
+   * A flight to another view, with the seconds since its start; null if there is none.
    *
    * @type {{ from: FlightEnd, to: FlightEnd, seconds: number }}
    */
@@ -90,13 +90,13 @@ export class Camera {
     return Math.max(M.length(M.sub(this.focus, this.position)), 1e-4 * this.radius);
   }
 
-  /** Units a second: the scene's size says how fast, what is near how careful. */
+  /** World units per second. The speed depends on the scene's size, and is lower near objects. */
   get pace() {
     const near = this.ahead ?? this.radius;
     return this.speed * M.clamp(0.6 * near, this.leastPace, 0.6 * this.radius);
   }
 
-  /** However near things are: careful at first, but who goes on pushing comes through. */
+  /** Minimum speed near objects. It is low at first, and rises if the user keeps moving. */
   get leastPace() {
     return 0.02 * this.radius * M.clamp(2 ** (2 * (this.pushedSeconds - 0.5)), 1, 10);
   }
@@ -107,7 +107,7 @@ export class Camera {
   }
 
   /**
-   * Whether a view is the camera's own, but for rounding.
+   * Whether a view equals the camera's view, except for rounding.
    *
    * @param {Pinhole} view
    */
@@ -125,7 +125,8 @@ export class Camera {
   }
 
   /**
-   * Turns about the upright axis and about the horizon; around the focus in orbit mode.
+   * Turns by yaw around the up axis and by pitch around the horizontal axis; in orbit mode around
+   * the focus.
    *
    * @param {number} yaw Radians.
    * @param {number} pitch Radians.
@@ -148,13 +149,13 @@ export class Camera {
     this.position = M.add(pivot, M.rotate(rotation, M.sub(this.position, pivot)));
   }
 
-  /** Keeps the focus ahead, at its distance. */
+  /** Moves the focus in front of the camera, at the same distance as before. */
   carryFocus() {
     this.focus = M.add(this.position, M.mul(this.forward, this.distance));
   }
 
   /**
-   * Moves by steps along the camera's axes.
+   * Moves by distances along the camera's axes.
    *
    * @param {number} right
    * @param {number} down
@@ -173,7 +174,7 @@ export class Camera {
   }
 
   /**
-   * Goes nearer to the focus by a factor; when that is reached, the focus goes ahead.
+   * Changes the distance to the focus by a factor. If the focus is reached, it is moved ahead.
    *
    * @param {number} factor Of the distance.
    */
@@ -188,7 +189,7 @@ export class Camera {
     this.position = M.add(this.focus, M.mul(away, factor));
   }
 
-  /** The directions of a push to the right, up and forward. */
+  /** The directions of movements to the right, up and forward. */
   get pushDirections() {
     if (this.mode === "walk") return [this.right, this.up, M.unit(M.cross(this.up, this.right))];
     if (this.mode === "fly") return [this.right, M.mul(this.down, -1), this.forward];
@@ -196,7 +197,7 @@ export class Camera {
   }
 
   /**
-   * Moves for some time.
+   * Moves the camera during some time.
    *
    * @param {Vector} push To the right, up and forward, each -1 to 1.
    * @param {number} seconds
@@ -219,13 +220,14 @@ export class Camera {
     this.moveBy(M.mul(this.velocity, seconds));
   }
 
-  /** Stands upright again, looking in the same direction. */
+  /** Turns the camera upright, without changing its direction. */
   level() {
     this.wxyz = M.looking(this.forward, this.up);
   }
 
   /**
-   * Is at a view from now on; the focus is ahead, at its distance.
+   * Moves the camera to a view at once. The focus is ahead of the camera, at the same distance as
+   * before.
    *
    * @param {Pinhole} view
    */
@@ -240,10 +242,10 @@ export class Camera {
   }
 
   /**
-   * Begins to fly to a view.
+   * Starts a flight to a view.
    *
    * @param {Pinhole} view
-   * @param {Vector | null} focus Of its orbits; what is ahead of the view if null.
+   * @param {Vector | null} focus The focus of the view; null means a point ahead of it.
    */
   flyTo(view, focus) {
     const forward = M.rotate(view.wxyz, [0, 0, 1]);
@@ -253,7 +255,7 @@ export class Camera {
   }
 
   /**
-   * Begins to fly to where a point is seen from its present side.
+   * Starts a flight to a view of a point, from the present side of the point.
    *
    * @param {Vector} point
    * @param {number} distance
@@ -265,7 +267,7 @@ export class Camera {
     this.flyTo({ wxyz, position, fov_y: this.fov_y }, point);
   }
 
-  /** @param {number} seconds For which a flight goes on. */
+  /** @param {number} seconds The time by which a flight advances. */
   advance(seconds) {
     if (!this.flight) return;
     const { from, to } = this.flight;

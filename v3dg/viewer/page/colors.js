@@ -1,7 +1,7 @@
-// Colours as texts and as numbers.
+// Conversion of colours between text and numbers.
 
 /**
- * A colour as #rrggbb.
+ * Returns a colour as #rrggbb.
  *
  * @param {number[]} color Red, green and blue, 0 to 1.
  */
@@ -15,9 +15,9 @@ export function hexOf(color) {
 }
 
 /**
- * Red, green and blue, 0 to 1; black where a text is no colour.
+ * Returns red, green and blue, 0 to 1; black if a text is not a colour.
  *
- * @param {string} text Six hexadecimal digits, behind # or not.
+ * @param {string} text Six hexadecimal digits, with or without #.
  * @returns {[number, number, number]}
  */
 export function colorOf(text) {

@@ -1,4 +1,4 @@
-// What keys do, but for those that move the camera while they are held.
+// The actions of keys, except for keys that move the camera while they are held.
 
 import { MODES } from "./camera.js";
 
@@ -6,7 +6,7 @@ import { MODES } from "./camera.js";
 
 const SPEED_STEP = 1.5;
 
-/** By the code of the key, which is that of its place on the keyboard. */
+/** Actions by the code of a key, which depends on its position on the keyboard. */
 const COMMANDS = /** @type {Record<string, (app: App) => void>} */ ({
   KeyH: (app) => app.places.showAll(),
   KeyL: (app) => app.places.level(),
@@ -21,7 +21,7 @@ const COMMANDS = /** @type {Record<string, (app: App) => void>} */ ({
 });
 
 /**
- * Does what a key means; returns whether it means something.
+ * Executes the action of a key; returns whether it has one.
  *
  * @param {App} app
  * @param {KeyboardEvent} event

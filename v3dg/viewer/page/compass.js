@@ -1,4 +1,4 @@
-// The world's axes in a corner of the picture.
+// Draws the axes of the world in a corner of the picture.
 
 import * as M from "./math.js";
 import { AXES } from "./camera.js";
@@ -6,11 +6,11 @@ import { element } from "./elements.js";
 
 /** @typedef {import("./camera.js").Camera} Camera */
 
-/** Colours of x, y and z. */
+/** Colours of the x, y and z axes. */
 export const AXIS_COLORS = ["#ff6b5e", "#7ad97a", "#5aa9ff"];
-/** To be seen on bright pictures, too. */
+/** Makes axes visible on bright pictures. */
 const EDGE_COLOR = "#000c";
-/** Px of the page: the side of the canvas, length of an axis, distance of its name. */
+/** In px of the page: the side of the canvas, the length of an axis, the distance of its name. */
 const SIDE = 80;
 const MIDDLE = SIDE / 2;
 const ARM = 20;
@@ -25,7 +25,7 @@ export class Compass {
     this.camera = camera;
   }
 
-  /** @param {number} ratio Px of the screen for one of the page. */
+  /** @param {number} ratio Px of the screen for each px of the page. */
   resize(ratio) {
     this.canvas.width = Math.round(SIDE * ratio);
     this.canvas.height = Math.round(SIDE * ratio);

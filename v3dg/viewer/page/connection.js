@@ -1,12 +1,14 @@
-// The connection to the server, which is made again when it is lost.
+// The connection to the server. It is opened again when it is lost.
 
 /** @typedef {import("./protocol.js").FromPage} FromPage */
 /** @typedef {import("./protocol.js").FromViewer} FromViewer */
 
 const RETRY_MS = 1000;
-/** Pictures are not asked for while more bytes than these wait to be sent. */
+/** No picture is requested while more than this number of bytes waits to be sent. */
 const MOST_WAITING_BYTES = 1 << 16;
-/** Files are sent in pieces of this size, so many of which may wait to be sent. */
+/**
+ * Size of the pieces in which files are sent, and the number of pieces that may wait to be sent.
+ */
 const PIECE_BYTES = 1 << 19;
 const MOST_WAITING_PIECES = 4;
 
@@ -16,8 +18,8 @@ export class Connection {
 
   /**
    * @param {(message: FromViewer, bytes: ArrayBuffer | null) => void} take Called with each
-   *   message, and with the bytes that belong to it.
-   * @param {(isOpen: boolean) => void} changed Called when the connection is made or lost.
+   *   message, and with the binary data that follows it.
+   * @param {(isOpen: boolean) => void} changed Called when the connection is opened or lost.
    */
   constructor(take, changed) {
     this.take = take;
@@ -41,7 +43,8 @@ export class Connection {
   }
 
   /**
-   * A message is text, or the length of the text (4 bytes), the text, and more bytes.
+   * A message is text; or binary data with the length of the text (4 bytes), the text, and more
+   * data.
    *
    * @param {string | ArrayBuffer} data
    */
@@ -59,7 +62,7 @@ export class Connection {
     return this.socket.readyState === WebSocket.OPEN;
   }
 
-  /** Whether what is sent now leaves at once. */
+  /** Whether a message would be sent without delay. */
   get isFree() {
     return this.isOpen && this.socket.bufferedAmount < MOST_WAITING_BYTES;
   }
@@ -70,10 +73,10 @@ export class Connection {
   }
 
   /**
-   * Sends a file in pieces; gives up when the connection is lost.
+   * Sends a file in pieces; stops if the connection is lost.
    *
    * @param {File} file
-   * @param {(share: number) => void} progress Called with the share that is sent, 0 to 1.
+   * @param {(share: number) => void} progress Called with the fraction that has been sent, 0 to 1.
    */
   async sendFile(file, progress) {
     this.send({ type: "open", name: file.name, size: file.size });

@@ -1,5 +1,5 @@
-// The panel's controls: each is made within an element, calls a function when it is used, and can
-// be set to a value that was chosen elsewhere.
+// The panel's controls. Each is created in an element, calls a function when it is used, and can be
+// set to a value that was chosen elsewhere.
 
 import { make } from "./elements.js";
 
@@ -14,10 +14,10 @@ import { make } from "./elements.js";
  * @typedef {object} Range
  * @property {number} low
  * @property {number} high
- * @property {number} [step] Of an even slider.
- * @property {boolean} [isLogarithmic] Whether a step is a factor, so that small values have room.
+ * @property {number} [step] Step of a linear slider.
+ * @property {boolean} [isLogarithmic] Whether a step is a factor.
  * @property {number} value
- * @property {(value: number) => string} [text] How a value is written.
+ * @property {(value: number) => string} [text] Returns a value as text.
  * @property {string} [title]
  */
 
@@ -25,13 +25,13 @@ import { make } from "./elements.js";
 const LOGARITHMIC_STEP = 0.01;
 
 /**
- * Puts a label before a control.
+ * Adds a label and a control.
  *
  * @param {HTMLElement} parent
  * @param {string} label
  * @param {HTMLElement} control
  * @param {string} title
- * @param {Node | string} output Between them.
+ * @param {Node | string} output Shown between the label and the control.
  */
 export function addLabelled(parent, label, control, title = "", output = "") {
   control.setAttribute("aria-label", label);
@@ -111,7 +111,7 @@ export function addColor(parent, label, { value, title }, act) {
 /**
  * @param {HTMLElement} parent
  * @param {string} label
- * @param {{ options: string[][], value: string, title?: string }} state Options: keys with texts.
+ * @param {{ options: string[][], value: string, title?: string }} state Pairs of key and text.
  * @param {(value: string) => void} act
  * @returns {Control<string>}
  */
@@ -153,7 +153,7 @@ export function addFaintText(parent) {
   return element;
 }
 
-/** @param {(Node | string)[][]} rows Their cells. */
+/** @param {(Node | string)[][]} rows The cells of each row. */
 export function tableOf(rows) {
   const lines = rows.map((cells) => make("tr", {}, ...cells.map((cell) => make("td", {}, cell))));
   return make("table", {}, ...lines);

@@ -1,5 +1,5 @@
-// The box by which an asset is cropped: its faces are dragged, and what is inside of it, or all
-// else, is saved as a new asset.
+// The box by which an asset is cropped. Its faces can be dragged, and the inside or the outside of
+// the box is saved as a new asset.
 
 import * as M from "./math.js";
 import { AXIS_COLORS } from "./compass.js";
@@ -12,12 +12,14 @@ import { edgesOf } from "./handles.js";
 /** @typedef {import("./projection.js").Projection} Projection */
 /** @typedef {import("./protocol.js").Crop} CropMessage */
 /** @typedef {import("./protocol.js").Picked} Picked */
-/** @typedef {[Vector, Vector]} Box Lower and upper corner. */
-/** @typedef {{ axis: number, end: 0 | 1 }} Face One of the six, by axis and corner. */
+/** @typedef {[Vector, Vector]} Box Minimum and maximum corner. */
+/** @typedef {{ axis: number, end: 0 | 1 }} Face One of the six faces, by axis and corner. */
 
 const BOX_COLOR = "#5ad1ff";
 const HANDLE_RADIUS = 7;
-/** An axis that points to the eye cannot be dragged along: the square of the least sine. */
+/**
+ * The square of the smallest sine: a face cannot be dragged along an axis that points to the eye.
+ */
 const LEAST_SINE2 = 1e-3;
 const LOCAL_AXES = [AXES.x, AXES.y, AXES.z];
 /** @type {Face[]} */
@@ -28,29 +30,30 @@ const FACES = [0, 1, 2].flatMap((axis) => [
 
 export class Crop {
   /**
-   * The instance whose bundle is cropped; null while nothing is.
+   * The instance whose bundle is cropped; null if there is no crop.
    *
    * @type {Picked}
    */
   subject = null;
   /**
-   * In the bundle's own coordinates.
+   * The box in the coordinates of the bundle.
    *
    * @type {Box}
    */
   box = null;
   /**
-   * The part that is saved.
+   * The part of the asset that is saved.
    *
    * @type {CropMessage["keep"]}
    */
   keep = "inside";
   /** Name of the new file. */
   name = "";
-  /** Whether the server has been asked for the subject. */
+  /** Whether the subject was requested from the server. */
   isWaiting = false;
   /**
-   * The face that is dragged and what it was when it was gripped, or null.
+   * The face that is dragged, with the pointer's place and the box at the start of the drag; null
+   * if no face is dragged.
    *
    * @type {{ face: Face, start: Place, box: Box }}
    */
@@ -69,7 +72,7 @@ export class Crop {
     return this.subject !== null;
   }
 
-  /** Begins with the selected instance, or with the only one. */
+  /** Starts with the selected instance, or with the only instance. */
   begin() {
     const { connection, instances, look } = this.app;
     if (instances.selected) {
@@ -92,7 +95,8 @@ export class Crop {
   }
 
   /**
-   * A box around nearly all of a bundle: without far outliers where it is all of the scene.
+   * Returns a box around nearly all of a bundle. If the bundle is the whole scene, far outliers are
+   * outside of the box.
    *
    * @param {Picked} picked
    * @returns {Box}
@@ -109,7 +113,7 @@ export class Crop {
     ];
   }
 
-  /** Forgets the box of another scene. */
+  /** Removes the box when another scene is opened. */
   reset() {
     this.subject = null;
     this.box = null;
@@ -122,7 +126,7 @@ export class Crop {
     this.app.sync();
   }
 
-  /** The box as `v3dg convert --crop` takes it. */
+  /** The box in the form that `v3dg convert --crop` accepts. */
   get text() {
     return `box:${this.box.flat().map(fiveDigits).join(",")}`;
   }
@@ -132,14 +136,14 @@ export class Crop {
     this.app.connection.send({ type: "crop", instance: subject.instance, box, keep, name });
   }
 
-  /** @param {Vector} point In the bundle's own coordinates. */
+  /** @param {Vector} point A point in the coordinates of the bundle. */
   inWorld(point) {
     const { pose } = this.subject;
     return M.add(pose.position, M.mul(M.rotate(pose.quaternion, point), pose.scale));
   }
 
   /**
-   * The middle of a face, in the bundle's own coordinates.
+   * Returns the middle of a face, in the coordinates of the bundle.
    *
    * @param {Face} face
    */
@@ -167,11 +171,12 @@ export class Crop {
   }
 
   /**
-   * Grips the face whose handle is nearest to a place of the picture; returns whether there is one.
+   * Starts to drag the face whose handle is nearest to a place in the picture; returns whether
+   * there is one.
    *
    * @param {number} x
    * @param {number} y
-   * @param {number} slack How near to it the place is at most, px.
+   * @param {number} slack Largest distance from the handle, px.
    */
   gripAt(x, y, slack) {
     if (!this.isOn) return false;
@@ -187,7 +192,7 @@ export class Crop {
   }
 
   /**
-   * Moves the gripped face along its axis, no further than to the opposite one.
+   * Moves the dragged face along its axis, but not beyond the opposite face.
    *
    * @param {number} x
    * @param {number} y
@@ -205,8 +210,8 @@ export class Crop {
   }
 
   /**
-   * How far from a face, along its axis, the point is that is nearest to what a place of the
-   * picture shows; null where the axis points to the eye.
+   * Returns the distance from a face, along its axis, of the point that is closest to the ray
+   * through a place in the picture; null if the axis points to the eye.
    *
    * @param {Face} face
    * @param {Place} place

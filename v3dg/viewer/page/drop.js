@@ -1,4 +1,4 @@
-// Files that are dropped onto the page, which the viewer then shows.
+// Sends files that are dropped onto the page to the viewer, which then shows them.
 
 import { element } from "./elements.js";
 

@@ -1,4 +1,4 @@
-// The page's elements: those of index.html by their ids, and new ones.
+// Finds elements of index.html by their ids, and creates new elements.
 
 /** @param {string} id */
 export function element(id) {
@@ -6,7 +6,7 @@ export function element(id) {
 }
 
 /**
- * Makes an element; attributes that are properties of it are set as such.
+ * Creates an element. Attributes that are properties of the element are set as properties.
  *
  * @template {keyof HTMLElementTagNameMap} Tag
  * @param {Tag} tag
@@ -25,7 +25,7 @@ export function make(tag, attributes = {}, ...children) {
 }
 
 /**
- * Has the browser save bytes as a file.
+ * Makes the browser save bytes as a file.
  *
  * @param {string} name
  * @param {ArrayBuffer} bytes

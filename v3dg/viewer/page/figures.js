@@ -1,4 +1,4 @@
-// The panel's figures: what the last picture cost, and what its colours mean.
+// The panel's statistics of the last picture, and the legend of its colours.
 
 import { shortText, tableOf } from "./controls.js";
 import { make } from "./elements.js";
@@ -27,7 +27,7 @@ function rowsOf({ figures, size }) {
     ["draw", `${figures.draw_ms.toFixed(1)} ms`],
     ["picture", `${size[0]} x ${size[1]}`],
   ];
-  if (figures.missing) rows.push(["pages missing", grouped(figures.missing)]);
+  if (figures.missing) rows.push(["missing pages", grouped(figures.missing)]);
   rows.push(["memory", `${grouped(mebibytes)} MiB`]);
   return rows;
 }
@@ -41,7 +41,7 @@ function legendOf({ shows, range }, scene) {
   if (shows === "residency") {
     const [none, ...missing] = scene.missing_colors.map(cssColor);
     const colors = [`${none} 25%`, `${missing[0]} 25%`, ...missing.slice(1)];
-    return barOf(colors, ["as wanted", "finer pages missing"]);
+    return barOf(colors, ["nothing missing", "finer pages missing"]);
   }
   if (!range) return [];
   const [low, high] = range.map(shortText);
@@ -61,8 +61,8 @@ function legendOf({ shows, range }, scene) {
 }
 
 /**
- * @param {string[]} colors Of a gradient, from left to right.
- * @param {string[]} marks Below it.
+ * @param {string[]} colors Colours of a gradient, from left to right.
+ * @param {string[]} marks Labels below the gradient.
  */
 function barOf(colors, marks) {
   const ramp = make("div", { className: "ramp" });
@@ -71,7 +71,7 @@ function barOf(colors, marks) {
 }
 
 /**
- * How many gaussians of each level are selected.
+ * Shows the number of selected gaussians of each level.
  *
  * @param {number[]} levels
  * @param {Scene} scene

@@ -1,4 +1,4 @@
-// The cameras of the file: frusta to click, and photographs to see over the picture.
+// The cameras of the file: frusta to click, and photographs that are shown over the picture.
 
 import * as M from "./math.js";
 import { element } from "./elements.js";
@@ -16,10 +16,10 @@ export class FileCameras {
   frustumSize = 0.05;
   /** Opacity of photographs. */
   opacity = 0.5;
-  /** Index of the camera whose frustum is under the pointer, or -1. */
+  /** Index of the camera whose frustum is under the pointer; -1 if there is none. */
   hovered = -1;
   /**
-   * The view from which the photograph is seen; null without one.
+   * The view of the photograph that is shown; null if none is shown.
    *
    * @type {View}
    */
@@ -36,7 +36,7 @@ export class FileCameras {
     this.showsFrusta = this.hasPhotographs;
   }
 
-  /** Forgets those of another scene. */
+  /** Removes the cameras when another scene is opened. */
   reset() {
     this.list = [];
   }
@@ -77,7 +77,7 @@ export class FileCameras {
   }
 
   /**
-   * Flies to a camera, whose whole picture then fits the window, and shows its photograph.
+   * Flies to a camera, so that its whole picture fits into the window, and shows its photograph.
    *
    * @param {number} index
    */
@@ -101,10 +101,10 @@ export class FileCameras {
   }
 
   /**
-   * Gives the photograph its place in the window.
+   * Positions the photograph in the window.
    *
-   * @param {View} view The camera's own.
-   * @param {number} tangent Of half the window's vertical field of view.
+   * @param {View} view The view of the photograph's camera.
+   * @param {number} tangent Tangent of half the window's vertical field of view.
    */
   fitPhotograph(view, tangent) {
     const { clientWidth, clientHeight } = this.app.look.stage;
@@ -117,7 +117,7 @@ export class FileCameras {
     style.height = `${height}px`;
   }
 
-  /** Shows the photograph while the camera is where it was taken. */
+  /** Shows the photograph if the camera is at its view, and hides it otherwise. */
   placePhotograph() {
     const isThere = this.photographView !== null && this.app.camera.isAt(this.photographView);
     this.photograph.hidden = !isThere || this.opacity === 0;

@@ -1,31 +1,31 @@
-// The browser's frames: what moves is moved on, a picture is asked for, and the page is drawn.
+// The browser's frames: advances movements, requests pictures, and draws the page.
 
 import * as M from "./math.js";
 
 /** @typedef {import("./app.js").App} App */
 
-/** A tab that was hidden does not leap. */
+/** Maximum time step in seconds, so that the camera does not jump after the tab was hidden. */
 const MOST_FRAME_SECONDS = 0.1;
 const LEAST_FRAME_SECONDS = 1e-3;
 /**
- * If the browser itself takes longer than this for a frame, as it does without a GPU, the last
- * picture follows the camera only every `SELDOM_MS`: the server may be on the same cores.
+ * If the browser needs longer than this for a frame, as without a GPU, the last picture follows the
+ * camera only every `SELDOM_MS`, because the server may use the same CPU.
  */
 const SLOW_FRAME_MS = 25;
 const SELDOM_MS = 100;
 
 export class Frames {
-  /** Whether the browser is going to call `draw`. */
+  /** Whether `draw` is scheduled for the next frame. */
   isDue = false;
-  /** Whether a picture came that has not been drawn yet. */
+  /** Whether a picture has arrived that is not drawn yet. */
   hasNewPicture = false;
   /** Time of the last frame, ms. */
   last = 0;
-  /** When the last frame was asked for, ms. */
+  /** Time at which the last frame was scheduled, ms. */
   requestedAt = 0;
-  /** When the page was last drawn, ms. */
+  /** Time at which the page was last drawn, ms. */
   drawnAt = 0;
-  /** How long the browser takes for a frame in which it draws, ms. */
+  /** Time that the browser needs for a frame in which it draws, ms. */
   frameMs = 0;
 
   /** @param {App} app */
@@ -33,7 +33,10 @@ export class Frames {
     this.app = app;
   }
 
-  /** Draws the page in the next frame, and asks for a picture if another one is wanted. */
+  /**
+   * Draws the page in the next frame, and requests a picture if the view or the settings have
+   * changed.
+   */
   redraw() {
     if (this.isDue) return;
     this.isDue = true;
@@ -68,7 +71,7 @@ export class Frames {
   }
 
   /**
-   * Moves the camera on; returns whether it moves by itself.
+   * Advances all movements; returns whether the camera is moving.
    *
    * @param {number} now
    * @param {number} seconds
@@ -82,7 +85,7 @@ export class Frames {
   }
 
   /**
-   * Whether the browser is too slow to draw the page again already.
+   * Whether the browser is too slow to draw the page again now.
    *
    * @param {number} now
    */

@@ -1,4 +1,4 @@
-// Frusta: those of the file's cameras, with photographs in them, and that of a frozen cut.
+// Draws frusta: those of the file's cameras, with their photographs, and that of a frozen cut.
 
 import * as M from "./math.js";
 
@@ -16,14 +16,17 @@ const HOVERED_COLOR = "#ffffff";
 const FROZEN_DEPTH = 0.08;
 const MOST_THUMBNAILS = 40;
 const THUMBNAIL_OPACITY = 0.85;
-/** A camera nearer than so many depths of its frustum is looked through. */
+/**
+ * Cameras closer than this number of frustum depths are not drawn, because the user looks through
+ * them.
+ */
 const NEAREST_DEPTHS = 0.7;
-/** How near to the middle of a frustum the pointer has to be, px. */
+/** Largest distance of the pointer from the middle of a frustum, px. */
 const HOVER_PX = 14;
 
 export class Frusta {
   /**
-   * Small photographs by the index of the camera.
+   * Small photographs, by the index of the camera.
    *
    * @type {Map<number, HTMLImageElement>}
    */
@@ -43,12 +46,12 @@ export class Frusta {
     return this.app.fileCameras.frustumSize * this.app.camera.radius;
   }
 
-  /** @param {View} view That the frozen cut was chosen for. */
+  /** @param {View} view The view for which the frozen cut was selected. */
   drawFrozen(view) {
     this.drawFrustum(view, FROZEN_DEPTH * this.app.camera.radius, FROZEN_COLOR, 2);
   }
 
-  /** Draws those of all cameras, the farthest first. */
+  /** Draws the frusta of all cameras, the farthest first. */
   draw() {
     const { camera, fileCameras } = this.app;
     const { depth } = this;
@@ -67,7 +70,7 @@ export class Frusta {
   }
 
   /**
-   * The corners of a frustum's far side, around it from the upper left one.
+   * Returns the corners of a frustum's far side in order, beginning with the upper left one.
    *
    * @param {View} view
    * @param {number} depth
@@ -89,7 +92,7 @@ export class Frusta {
    * @param {View} view
    * @param {number} depth
    * @param {string} color
-   * @param {number} width Of its lines, px.
+   * @param {number} width Width of the lines, px.
    */
   drawFrustum(view, depth, color, width) {
     const corners = this.corners(view, depth);
@@ -109,7 +112,8 @@ export class Frusta {
   }
 
   /**
-   * The index of the camera whose frustum is at a place of the picture, or -1.
+   * Returns the index of the camera whose frustum is at a place in the picture; -1 if there is
+   * none.
    *
    * @param {number} x
    * @param {number} y
@@ -144,19 +148,20 @@ export class Frusta {
     if (!image.naturalWidth || places.includes(null)) return;
     const [upperLeft, upperRight, lowerRight, lowerLeft] = places;
     const { naturalWidth, naturalHeight } = image;
-    // Two triangles, each by the affine map that is right at its three corners.
+    // A photograph is drawn as two triangles, each with the affine map that is exact at its
+    // corners.
     this.drawHalf(image, [0, 0], 1, [upperLeft, upperRight, lowerLeft]);
     this.drawHalf(image, [naturalWidth, naturalHeight], -1, [lowerRight, lowerLeft, upperRight]);
   }
 
   /**
-   * Draws the half of an image that lies in a triangle.
+   * Draws the half of an image that is inside a triangle.
    *
    * @param {HTMLImageElement} image
-   * @param {Place} origin The image's corner that is at the first of the triangle, px.
-   * @param {1 | -1} sign Of the directions from there in which the image's sides go.
-   * @param {Place[]} triangle Right angle of the half, end of its horizontal side, and of its
-   *   vertical one.
+   * @param {Place} origin The corner of the image at the first corner of the triangle, px.
+   * @param {1 | -1} sign Sign of the directions of the image's sides from that corner.
+   * @param {Place[]} triangle The corner with the right angle, the end of the horizontal side,
+   *   and the end of the vertical side.
    */
   drawHalf(image, origin, sign, [corner, sideways, downwards]) {
     const { context } = this.projection;
@@ -178,7 +183,7 @@ export class Frusta {
   }
 
   /**
-   * The photograph of a camera, which is loaded when it is first wanted.
+   * Returns the photograph of a camera, which is loaded on first use.
    *
    * @param {number} index
    */

@@ -1,4 +1,4 @@
-// What dragging a handle does to the pose of an instance.
+// Computes the pose of an instance while one of its handles is dragged.
 
 import * as M from "./math.js";
 import { AXES } from "./camera.js";
@@ -8,32 +8,35 @@ import { AXES } from "./camera.js";
 /** @typedef {import("./protocol.js").Pose} Pose */
 
 /**
- * A handle that is dragged: along an axis, in the picture's plane, around an axis, or away from
- * the middle.
+ * A drag of a handle: along an axis, in the plane of the picture, around an axis, or away from the
+ * middle.
  *
  * @typedef {object} Grip
  * @property {"move" | "slide" | "turn" | "size"} kind
  * @property {number} axis Index of the axis; -1 for none.
- * @property {Place} start Where it was gripped.
- * @property {Pose} pose That the instance had then.
- * @property {Place} middle Where the instance was in the picture.
+ * @property {Place} start Where the drag started.
+ * @property {Pose} pose The pose of the instance at the start.
+ * @property {Place} middle The place of the instance in the picture at the start.
  */
 
 export const WORLD_AXES = [AXES.x, AXES.y, AXES.z];
 const MIN_SCALE = 1e-6;
 const MAX_SCALE = 1e6;
-/** An axis that points to the eye is short in the picture; a drag along it is not endless. */
+/**
+ * Minimum length of an axis in the picture: a drag along an axis that points to the eye must not
+ * move the instance infinitely far.
+ */
 const LEAST_AXIS_PX = 5;
-/** A drag that begins in the middle scales no faster than one that begins so far from it. */
+/** Minimum distance from the middle: a drag that starts closer than this does not scale faster. */
 const LEAST_RADIUS_PX = 5;
 
 /**
- * The pose of an instance when its handle is dragged to a place of the picture.
+ * Returns the pose of an instance when its handle is dragged to a place in the picture.
  *
  * @param {Grip} grip
  * @param {Place} place
  * @param {Projection} projection
- * @param {number} reach Length of a handle along an axis, world units.
+ * @param {number} reach Length of an axis handle in world units.
  * @returns {Pose}
  */
 export function draggedPose(grip, place, projection, reach) {

@@ -1,4 +1,4 @@
-// The selected instance: its box, and handles that move, turn and scale it.
+// The selected instance: its box, and handles that move, rotate and scale it.
 
 import * as M from "./math.js";
 import { AXIS_COLORS } from "./compass.js";
@@ -33,7 +33,7 @@ export class Handles {
     return this.app.instances.selected.pose;
   }
 
-  /** Length of handles where the instance is, world units. */
+  /** Length of the handles at the depth of the instance, in world units. */
   get reach() {
     const [, , ahead] = this.projection.inCamera(this.pose.position);
     const depth = Math.max(ahead, 1e-6 * this.app.camera.radius);
@@ -41,7 +41,7 @@ export class Handles {
   }
 
   /**
-   * The end of the handle along an axis.
+   * Returns the end of the handle along an axis.
    *
    * @param {number} axis
    */
@@ -50,7 +50,7 @@ export class Handles {
   }
 
   /**
-   * Points of the handle around an axis; the last one is the first.
+   * Returns points of the handle around an axis. The last point equals the first.
    *
    * @param {number} axis
    */
@@ -118,11 +118,11 @@ export class Handles {
   }
 
   /**
-   * The handle at a place of the picture, or null.
+   * Returns the handle at a place in the picture; null if there is none.
    *
    * @param {number} x
    * @param {number} y
-   * @param {number} slack How near to it the place is at most, px.
+   * @param {number} slack Largest distance from the handle, px.
    * @returns {Grip | null}
    */
   gripAt(x, y, slack) {
@@ -144,7 +144,7 @@ export class Handles {
   }
 
   /**
-   * The axis whose handle is nearest to a place of the picture, or -1.
+   * Returns the axis whose handle is nearest to a place in the picture; -1 if none is near.
    *
    * @param {number} x
    * @param {number} y
@@ -171,7 +171,7 @@ export class Handles {
   }
 
   /**
-   * The pose that the instance has when its handle is dragged to a place of the picture.
+   * Returns the pose of the instance when its handle is dragged to a place in the picture.
    *
    * @param {number} x
    * @param {number} y
@@ -183,7 +183,7 @@ export class Handles {
 }
 
 /**
- * The edges of an instance's box, in the world.
+ * Returns the edges of an instance's box in the world.
  *
  * @param {Pick<Picked, "pose" | "box">} placed
  */
@@ -191,7 +191,7 @@ export function edgesOf(placed) {
   const corners = cornersOf(placed);
   /** @type {Line[]} */
   const edges = [];
-  // The bits of a corner's index say at which end of each axis it is.
+  // Each bit of a corner's index tells at which end of an axis the corner is.
   corners.forEach((corner, i) => {
     for (const bit of [1, 2, 4]) {
       if ((i & bit) === 0) edges.push([corner, corners[i | bit]]);
@@ -201,7 +201,7 @@ export function edgesOf(placed) {
 }
 
 /**
- * The corners of an instance's box, in the world.
+ * Returns the corners of an instance's box in the world.
  *
  * @param {Pick<Picked, "pose" | "box">} placed
  */
@@ -215,7 +215,7 @@ function cornersOf({ pose, box }) {
 
 /**
  * @param {Place} place
- * @param {(Place | null)[]} places Ends of lines that follow each other; null where not seen.
+ * @param {(Place | null)[]} places Points of a polyline; null for points that are not visible.
  */
 function distanceToLines(place, places) {
   let result = Infinity;

@@ -1,4 +1,4 @@
-// Instances of the scene: one is picked, selected, moved, and put back.
+// Instances of the scene: picking, selecting, moving, and undoing.
 
 import * as M from "./math.js";
 
@@ -8,35 +8,35 @@ import * as M from "./math.js";
 /** @typedef {import("./protocol.js").Picked} Picked */
 /** @typedef {import("./protocol.js").Pose} Pose */
 
-/** Distance to an instance that the camera flies to, in sizes of its box. */
+/** Distance between the camera and an instance after a flight to it, in sizes of its box. */
 const SIZES_AWAY = 1.5;
 
 export class Instances {
   /**
-   * The selected instance, or null.
+   * The selected instance; null if there is none.
    *
    * @type {Picked}
    */
   selected = null;
   /**
-   * What dragging a handle changes.
+   * The part of a pose that dragging a handle changes.
    *
    * @type {Tool}
    */
   tool = "move";
   /**
-   * The handle that is dragged, or null.
+   * The handle that is dragged; null if there is none.
    *
    * @type {Grip}
    */
   grip = null;
   /**
-   * Poses that `undo` goes back to, the last one first to go.
+   * Poses that `undo` restores, the most recent one last.
    *
    * @type {{ instance: number, pose: Pose }[]}
    */
   earlierPoses = [];
-  /** Whether the camera flies to what is picked next. */
+  /** Whether the camera flies to the next picked point. */
   fliesToPicked = false;
 
   /** @param {App} app */
@@ -44,24 +44,24 @@ export class Instances {
     this.app = app;
   }
 
-  /** Forgets those of another scene. */
+  /** Forgets selection and poses when another scene is opened. */
   reset() {
     this.selected = null;
     this.earlierPoses = [];
   }
 
   /**
-   * Asks what is at a place of the picture, to turn around it and to select it.
+   * Asks for the instance at a place in the picture, to select it and to orbit around the point.
    *
-   * @param {number} x Share of the width.
-   * @param {number} y Share of the height.
+   * @param {number} x Position as a fraction of the width.
+   * @param {number} y Position as a fraction of the height.
    */
   pick(x, y) {
     this.sendPick(x, y, false);
   }
 
   /**
-   * As `pick`, and flies there.
+   * Picks like `pick`, and flies to the point.
    *
    * @param {number} x
    * @param {number} y
@@ -84,7 +84,7 @@ export class Instances {
   }
 
   /**
-   * Flies to an instance, wherever it is.
+   * Flies to an instance by its number.
    *
    * @param {number} instance
    */
@@ -93,7 +93,7 @@ export class Instances {
     this.app.connection.send({ type: "pick", look: this.app.look.message, instance });
   }
 
-  /** @param {Picked} picked What the server answers. */
+  /** @param {Picked} picked The answer of the server. */
   take(picked) {
     if (picked.instance === undefined) {
       this.select(null);
@@ -120,7 +120,9 @@ export class Instances {
     this.app.sync();
   }
 
-  /** Flies to the selected instance; without one, to what the camera turns around. */
+  /**
+   * Flies to the selected instance; if there is none, to the point around which the camera orbits.
+   */
   flyToSelected() {
     const { camera } = this.app;
     if (this.selected) {
@@ -138,7 +140,7 @@ export class Instances {
   }
 
   /**
-   * Moves the selected instance, as its handle is dragged.
+   * Changes the pose of the selected instance while its handle is dragged.
    *
    * @param {Pose} pose
    */
@@ -158,7 +160,7 @@ export class Instances {
     app.redraw();
   }
 
-  /** Lets go of the handle; from now on the movement can be undone. */
+  /** Ends the drag of a handle, and records its start for undoing. */
   letGo() {
     this.earlierPoses.push({ instance: this.selected.instance, pose: this.grip.pose });
     this.grip = null;
@@ -175,7 +177,7 @@ export class Instances {
 }
 
 /**
- * The diagonal of an instance's box, world units.
+ * Returns the length of the diagonal of an instance's box in world units.
  *
  * @param {Picked} picked
  */

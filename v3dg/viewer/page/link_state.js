@@ -1,4 +1,4 @@
-// What the page's address says after `#`: where the camera is, and the settings.
+// The part of the page's address after `#`: the camera and the settings.
 
 import * as M from "./math.js";
 import { colorOf, hexOf } from "./colors.js";
@@ -14,7 +14,7 @@ import { AXES, MODES, SPEED_BOUNDS, isMode } from "./camera.js";
 /** Field of view in degrees. */
 const FOV_BOUNDS = [1, 170];
 const RESOLUTION_BOUNDS = [0.1, 1];
-/** What a link that does not say it means, beside the settings' defaults. */
+/** Values that a link need not contain, in addition to the defaults of the settings. */
 const USUAL = { mode: MODES[0], speed: 1, resolution: 1 };
 
 export class LinkState {
@@ -26,7 +26,7 @@ export class LinkState {
     });
   }
 
-  /** A link to what is looked at now, from `#` on; what it means anyway is left out. */
+  /** A link to the current view, from `#` on, without values that are defaults. */
   get hash() {
     const { camera, look, places, greeting } = this.app;
     /** @type {Parts} */
@@ -43,12 +43,12 @@ export class LinkState {
     };
     /** @type {Parts} */
     const usual = { ...USUAL, ...partsOf(greeting.defaults) };
-    delete usual.tolerance; // a link says it always
+    delete usual.tolerance; // always part of a link
     const said = Object.entries(parts).filter(([name, value]) => usual[name] !== value);
     return `#${said.map(([name, value]) => `${name}=${value}`).join("&")}`;
   }
 
-  /** Has the address lead to what is looked at now. */
+  /** Updates the address of the page to the current view. */
   write() {
     history.replaceState(null, "", this.hash);
   }
@@ -58,15 +58,15 @@ export class LinkState {
     this.write();
     try {
       await navigator.clipboard.writeText(url);
-      this.app.status.confirm("The link is in the clipboard.");
+      this.app.status.confirm("The link was copied to the clipboard.");
     } catch {
-      // Without encryption a page may not use the clipboard.
+      // Browsers do not allow unencrypted pages to use the clipboard.
       this.app.status.confirm("The link is in the address bar.");
     }
   }
 
   /**
-   * Goes where a link leads; a place that it does not say, or says wrongly, stays.
+   * Applies a link. Values that are missing or invalid are not changed.
    *
    * @param {string} hash
    * @param {"jump" | "fly"} manner
@@ -123,12 +123,12 @@ export class LinkState {
     settings.split = values.number("split", [0, 1]) ?? defaults.split;
     if (settings.split && !shows_cuts) {
       settings.split = 0;
-      this.app.status.warn("The link's split is not there: a pool on a GPU has none.");
+      this.app.status.warn("The link's split is not available with a pool on a GPU.");
     }
   }
 
   /**
-   * What a link asks to show; null if the scene cannot show it.
+   * Returns the mode in a link; null if it is missing, or if the scene does not support it.
    *
    * @param {LinkValues} values
    * @returns {Shows | null}
@@ -138,13 +138,15 @@ export class LinkState {
     const shows = values.text("show") ?? this.app.greeting.defaults.shows;
     const mode = modes.find((name) => name === shows);
     if (!mode) {
-      this.app.status.warn(`The link's mode ${shows} is not there; ${modes.join(", ")} are.`);
+      this.app.status.warn(
+        `The link's mode ${shows} is not available here; ${modes.join(", ")} are.`,
+      );
     }
     return mode ?? null;
   }
 }
 
-/** The values of a link by their names; null where one is missing or wrong. */
+/** The values in a link by name; null for a value that is missing or invalid. */
 class LinkValues {
   /** @param {string} hash */
   constructor(hash) {
@@ -157,7 +159,7 @@ class LinkValues {
   }
 
   /**
-   * A number, brought within bounds.
+   * Returns a number, clamped to bounds.
    *
    * @param {string} name
    * @param {number[]} bounds
@@ -170,7 +172,7 @@ class LinkValues {
   }
 
   /**
-   * So many numbers, separated by commas.
+   * Returns a given count of numbers that are separated by commas.
    *
    * @param {string} name
    * @param {number} count
@@ -180,7 +182,7 @@ class LinkValues {
     return values.length === count && values.every(Number.isFinite) ? values : null;
   }
 
-  /** The direction that is up: an axis, or three numbers. */
+  /** Returns the up direction, which is the name of an axis or three numbers. */
   up() {
     const name = this.text("up");
     if (Object.hasOwn(AXES, name)) return AXES[/** @type {keyof AXES} */ (name)];
@@ -189,7 +191,7 @@ class LinkValues {
 }
 
 /**
- * Settings as a link says them.
+ * Returns settings in the form of a link.
  *
  * @param {Settings} settings
  * @returns {Parts}

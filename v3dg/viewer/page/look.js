@@ -1,23 +1,24 @@
-// What is asked for: the camera's view, the size of the picture, and the settings.
+// The request for a picture: the camera's view, the size of the picture, and the settings.
 
 /** @typedef {import("./camera.js").Camera} Camera */
 /** @typedef {import("./protocol.js").Look} LookMessage */
 /** @typedef {import("./protocol.js").Settings} Settings */
 /** @typedef {import("./protocol.js").Hello} Hello */
 
-/** Most px of the picture for one px of the page. */
+/** Maximum number of picture px for each px of the page. */
 const MOST_PIXEL_RATIO = 2;
 
 export class Look {
   /**
-   * What the picture shows, and how finely; null until the server has said what it begins with.
+   * The content and the quality of the picture; null until the server has sent the initial
+   * settings.
    *
    * @type {Settings}
    */
   settings = null;
-  /** Px of the picture for one px of the window, as a share of what the screen can show. */
+  /** Resolution of the picture as a fraction of the resolution of the screen. */
   resolution = 1;
-  /** Longest side of a picture, px. */
+  /** Maximum length of the longer side of a picture, px. */
   mostPixels = 0;
 
   /**
@@ -35,7 +36,7 @@ export class Look {
     this.mostPixels = hello.limits.picture_px;
   }
 
-  /** Width over height. */
+  /** Width divided by height. */
   get aspect() {
     return this.stage.clientWidth / this.stage.clientHeight;
   }

@@ -2,5 +2,5 @@
 
 import { App } from "./app.js";
 
-/** For tests and programs that take pictures of the page. */
+/** Public for tests and for programs that take screenshots of the page. */
 window.viewer = new App();

@@ -1,4 +1,4 @@
-// Vectors as arrays, rotations as quaternions [w, x, y, z].
+// Vector functions. Vectors are arrays, and rotations are quaternions [w, x, y, z].
 
 /** @typedef {import("./page.js").Pinhole} Pinhole */
 /** @typedef {import("./page.js").Quaternion} Quaternion */
@@ -11,7 +11,7 @@ const IDENTITY = [
   [0, 1, 0],
   [0, 0, 1],
 ];
-/** Most that the plane of a picture is moved, in its distances. */
+/** Maximum shift of the picture's plane, as a multiple of its distance. */
 const MOST_SHIFT = 0.7;
 
 /**
@@ -64,7 +64,7 @@ export function length(a) {
 }
 
 /**
- * A vector of the same direction and of length one; zero for zero.
+ * Returns a vector of the same direction with length one; the zero vector stays zero.
  *
  * @template {number[]} V
  * @param {V} a
@@ -74,7 +74,7 @@ export function unit(a) {
 }
 
 /**
- * From `a` (t = 0) to `b` (t = 1) along a line.
+ * Interpolates linearly from `a` (t = 0) to `b` (t = 1).
  *
  * @template {number[]} V
  * @param {V} a
@@ -114,7 +114,7 @@ export function radians(angle) {
 }
 
 /**
- * The numbers of a text, separated by spaces or commas; NaN for what is none.
+ * Returns the numbers in a text, which are separated by spaces or commas; NaN for other words.
  *
  * @param {string} text
  */
@@ -126,7 +126,7 @@ export function numbersOf(text) {
 }
 
 /**
- * A world axis that is not parallel to a direction of length one.
+ * Returns a world axis that is not parallel to a direction of length one.
  *
  * @param {Vector} direction
  * @returns {Vector}
@@ -137,7 +137,7 @@ export function axisAcross(direction) {
 }
 
 /**
- * The rotation by `b`, then by `a`.
+ * Returns the rotation by `b`, followed by the rotation by `a`.
  *
  * @param {Quaternion} a
  * @param {Quaternion} b
@@ -180,7 +180,7 @@ export function rotate(q, v) {
 }
 
 /**
- * From `a` (t = 0) to `b` (t = 1) along the shorter arc.
+ * Interpolates from `a` (t = 0) to `b` (t = 1) along the shorter arc.
  *
  * @param {Quaternion} a
  * @param {Quaternion} b
@@ -198,7 +198,7 @@ export function slerp(a, b, t) {
 }
 
 /**
- * The rotation whose columns are three right-handed axes of length one.
+ * Returns the rotation whose columns are three right-handed axes of length one.
  *
  * @param {Vector} x
  * @param {Vector} y
@@ -221,8 +221,8 @@ export function fromAxes(x, y, z) {
 }
 
 /**
- * The rotation from camera (x right, y down, z forward) to world of a camera that looks along
- * `forward`.
+ * Returns the rotation from camera (x right, y down, z forward) to world for a camera that looks
+ * along `forward`.
  *
  * @param {Vector} forward
  * @param {Vector} up
@@ -236,13 +236,13 @@ export function looking(forward, up) {
 }
 
 /**
- * The homography that shows a picture of one view from another view, for what lies on a plane
- * at a distance from the first.
+ * Returns the homography that shows a picture of one view from another view. It is exact for points
+ * on a plane at a distance from the first view.
  *
  * @param {Pinhole} before
  * @param {Pinhole} now
  * @param {number} distance
- * @param {number} width Of the element, px.
+ * @param {number} width Width of the element, px.
  * @param {number} height
  * @returns {string | null} The CSS transform of an element whose origin is its upper left
  *   corner; null if the middle of the picture is behind the other view.
@@ -252,7 +252,7 @@ export function warp(before, now, distance, width, height) {
   const newAxes = IDENTITY.map((axis) => rotate(now.wxyz, axis));
   const step = sub(before.position, now.position);
   let shift = newAxes.map((axis) => dot(axis, step) / distance);
-  // A plane says little about what is near.
+  // A plane is a bad approximation for near objects, so the shift is limited.
   if (length(shift) > MOST_SHIFT) shift = mul(shift, MOST_SHIFT / length(shift));
   const turn = /** @type {Matrix} */ (
     newAxes.map((axis) => oldAxes.map((oldAxis) => dot(axis, oldAxis)))

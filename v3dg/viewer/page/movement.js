@@ -1,4 +1,4 @@
-// What moves the camera while it is held: keys, the pad on the screen, and gamepads.
+// Continuous movement of the camera by keys, the pad on the screen, and gamepads.
 
 import * as M from "./math.js";
 import { runCommand } from "./commands.js";
@@ -8,7 +8,7 @@ import { element } from "./elements.js";
 /** @typedef {import("./page.js").Vector} Vector */
 
 /**
- * Pushes to the right, up and forward, by the code of the key.
+ * Movements to the right, up and forward, by the code of the key.
  *
  * @type {Record<string, Vector>}
  */
@@ -28,9 +28,9 @@ const PUSHES = {
 };
 const FAST = 4;
 const SLOW = 0.25;
-/** A stick of a gamepad that rests says less than this. */
+/** Values of a gamepad's stick below this count as zero. */
 const DEAD_ZONE = 0.14;
-/** Radians a second at a stick's end. */
+/** Turning speed in radians per second, for a stick that is pushed completely. */
 const YAW_SPEED = 1.8;
 const PITCH_SPEED = 1.4;
 /** Buttons of a standard gamepad. */
@@ -38,7 +38,7 @@ const LEFT_SHOULDER = 4;
 const RIGHT_SHOULDER = 5;
 const LEFT_TRIGGER = 6;
 const RIGHT_TRIGGER = 7;
-/** Of the pad on the screen, px: half its width, how far a finger goes, and the knob. */
+/** The pad on the screen, px: half its width, the reach of a finger, and the knob. */
 const PAD_CENTER = 55;
 const PAD_REACH = 45;
 const KNOB_REACH = 35;
@@ -55,7 +55,7 @@ export class Movement {
   /** Whether Alt is held. */
   isSlow = false;
   /**
-   * Push of the pad on the screen, to the right and down.
+   * Movement of the pad on the screen, to the right and down.
    *
    * @type {[number, number]}
    */
@@ -137,7 +137,7 @@ export class Movement {
   }
 
   /**
-   * Moves the camera for some time; returns whether anything pushes it.
+   * Moves the camera during some time; returns whether it is moving.
    *
    * @param {number} seconds
    */
@@ -176,7 +176,7 @@ function isPush(event) {
 }
 
 /**
- * Whether a key is meant for a control of the panel into which one writes or in which one chooses.
+ * Whether a key is meant for a control of the panel for typing or choosing.
  *
  * @param {KeyboardEvent} event
  */
@@ -202,7 +202,7 @@ function connectedGamepads() {
   );
 }
 
-/** @param {number} value Of an axis of a stick, -1 to 1. */
+/** @param {number} value Value of a stick's axis, -1 to 1. */
 function withoutDeadZone(value) {
   if (Math.abs(value) < DEAD_ZONE) return 0;
   return (value - DEAD_ZONE * Math.sign(value)) / (1 - DEAD_ZONE);

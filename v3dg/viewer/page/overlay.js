@@ -1,4 +1,4 @@
-// What is drawn over the picture: frusta, the selected instance, the box of a crop, and the axes.
+// Draws over the picture: frusta, the selected instance, the box of a crop, and the axes.
 
 import { Compass } from "./compass.js";
 import { Crop } from "./crop.js";
@@ -9,7 +9,7 @@ import { Projection } from "./projection.js";
 
 /** @typedef {import("./app.js").App} App */
 
-/** Narrower windows show no axes. */
+/** Minimum width of a window that shows the axes. */
 const LEAST_WIDTH_OF_COMPASS_PX = 700;
 
 export class Overlay {
@@ -46,11 +46,11 @@ export class Overlay {
     const { frozen } = app.look.settings;
     const hasObject = app.instances.selected || this.crop.isOn;
     const isEmpty = !frozen && !app.fileCameras.showsFrusta && !hasObject;
-    // A transparent layer is not blended over the picture, which takes long without a GPU.
+    // An empty layer is made transparent, because blending it takes long without a GPU.
     this.canvas.style.opacity = isEmpty ? "0" : "1";
     if (isEmpty) return;
     context.clearRect(0, 0, projection.width, projection.height);
-    // Browsers may not show a frame that is only cleared.
+    // Browsers may not show a frame that was only cleared.
     context.fillStyle = "#00000003";
     context.fillRect(0, 0, 1, 1);
     if (frozen) this.frusta.drawFrozen(frozen);

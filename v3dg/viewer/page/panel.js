@@ -1,4 +1,4 @@
-// The panel: figures of the last picture, and folders of controls.
+// The panel: statistics of the last picture, and folders of controls.
 
 import { tableOf } from "./controls.js";
 import { element, make } from "./elements.js";
@@ -15,28 +15,28 @@ import { InstancesFolder, PathFolder } from "./panel_scene.js";
 const KEYS = [
   ["drag", "turn"],
   ["right or Shift drag, two fingers", "move sideways"],
-  ["wheel, pinch", "near and far"],
-  ["click", "turn around this, select its instance"],
+  ["wheel, pinch", "move closer or away"],
+  ["click", "orbit around this point, select its instance"],
   ["double click", "fly there"],
   ["W A S D Q E", "fly"],
   ["Shift, Alt", "faster, slower"],
   ["+ −", "speed"],
   ["M", "orbit, fly, walk"],
   ["H", "show all"],
-  ["F", "fly to what is selected"],
-  ["L", "stand upright"],
-  ["B, 1 … 9", "keep a bookmark, go to it"],
-  ["G R T", "move, turn, scale the instance"],
-  ["Ctrl+Z", "take back"],
-  ["Esc", "let go"],
-  ["P", "panel"],
+  ["F", "fly to the selected instance"],
+  ["L", "turn upright"],
+  ["B, 1 … 9", "add a bookmark, go to it"],
+  ["G R T", "move, rotate, scale the instance"],
+  ["Ctrl+Z", "undo"],
+  ["Esc", "deselect"],
+  ["P", "show or hide the panel"],
 ];
 
 export class Panel {
   root = element("panel");
   figures = make("div");
   /**
-   * All folders with controls; none until a scene is there.
+   * All folders with controls; empty until a scene is shown.
    *
    * @type {Folder[]}
    */
@@ -51,7 +51,7 @@ export class Panel {
     this.app = app;
   }
 
-  /** Makes all of it anew, for a scene. */
+  /** Rebuilds the panel for a scene. */
   build() {
     const { app } = this;
     this.figures.replaceChildren();
@@ -85,7 +85,7 @@ export class Panel {
     return folder;
   }
 
-  /** Has the controls show what was set elsewhere. */
+  /** Updates the controls after a change that was made elsewhere. */
   sync() {
     for (const folder of this.folders) folder.sync();
   }
@@ -104,7 +104,7 @@ export class Panel {
     this.path.recording.set(isRecording);
   }
 
-  /** @param {number} share Of the work that is done, 0 to 1. */
+  /** @param {number} share Fraction of the work that is done, 0 to 1. */
   showProgress(share) {
     this.path.progress.hidden = false;
     this.path.progress.value = share;

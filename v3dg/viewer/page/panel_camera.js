@@ -1,4 +1,4 @@
-// The panel's folders about the camera: how it moves, where it can go, and those of the file.
+// The panel's folders about the camera: movement, places, and the cameras of the file.
 
 import * as controls from "./controls.js";
 import { make } from "./elements.js";
@@ -8,7 +8,7 @@ import { degrees, radians } from "./math.js";
 /** @typedef {import("./page.js").Axis} Axis */
 
 const UP_AXES = ["z", "y", "x", "-z", "-y", "-x"];
-/** The option of an upright direction that is no axis; choosing it changes nothing. */
+/** The option for an up direction that is not an axis. Choosing it changes nothing. */
 const OTHER = "other";
 
 export class MovementFolder {
@@ -23,7 +23,7 @@ export class MovementFolder {
     this.up = this.addUp(parent);
     const row = controls.addRow(parent);
     controls.addButton(row, "Show all", () => app.places.showAll(), "H");
-    controls.addButton(row, "Level", () => app.places.level(), "Stand upright (L)");
+    controls.addButton(row, "Level", () => app.places.level(), "Turn the camera upright (L)");
     this.pace = controls.addFaintText(parent);
   }
 
@@ -49,7 +49,7 @@ export class MovementFolder {
       isLogarithmic: true,
       value: this.app.camera.speed,
       text: (/** @type {number} */ speed) => `× ${Number(speed.toPrecision(2))}`,
-      title: "Of flying and walking. At 1 it suits the scene's size, and what is near.",
+      title: "Speed of flying and walking. 1 adapts to the size of the scene and to near objects.",
     };
     return controls.addSlider(parent, "Speed", range, (speed) => {
       this.app.camera.setSpeed(speed);
@@ -77,7 +77,7 @@ export class MovementFolder {
     const state = {
       options: [...UP_AXES, OTHER].map((axis) => [axis, axis]),
       value: this.app.places.upAxis ?? OTHER,
-      title: "The axis that is upright: orbits go around it.",
+      title: "The axis that points up. The camera orbits around it.",
     };
     return controls.addSelect(parent, "Up", state, (axis) => {
       if (axis === OTHER) this.app.sync();
@@ -93,9 +93,9 @@ export class PlacesFolder {
    */
   constructor(app, parent) {
     this.app = app;
-    const placeholder = "x y z, or #12, or a camera's name";
+    const placeholder = "x y z, #12 or a camera's name";
     this.text = make("input", { type: "text", placeholder });
-    const title = "A point, an instance by its number, or a camera";
+    const title = "A point, the number of an instance, or the name of a camera";
     controls.addLabelled(parent, "Go to", this.text, title);
     this.text.addEventListener("keydown", (event) => {
       if (event.key === "Enter") this.go();
@@ -103,7 +103,7 @@ export class PlacesFolder {
     const row = controls.addRow(parent);
     controls.addButton(row, "Go", () => this.go());
     controls.addButton(row, "Add bookmark", () => app.bookmarks.add(), "B");
-    const copyTitle = "An address that leads here, with these settings";
+    const copyTitle = "An address of this view with these settings";
     controls.addButton(row, "Copy link", () => app.linkState.copy(), copyTitle);
     this.bookmarks = make("ul");
     parent.append(this.bookmarks);
@@ -147,7 +147,7 @@ export class FileCamerasFolder {
     const { fileCameras } = this.app;
     const names = fileCameras.list.map(({ name }, i) => [String(i), name]);
     const state = { options: [["", ""], ...names], value: "" };
-    controls.addSelect(parent, "Of the file", state, (index) => {
+    controls.addSelect(parent, "Camera", state, (index) => {
       if (index !== "") fileCameras.lookThrough(Number(index));
     });
   }
@@ -155,7 +155,10 @@ export class FileCamerasFolder {
   /** @param {HTMLElement} parent */
   addFrusta(parent) {
     const { fileCameras } = this.app;
-    const state = { value: fileCameras.showsFrusta, title: "Click one to look through it" };
+    const state = {
+      value: fileCameras.showsFrusta,
+      title: "Click a frustum to look through its camera",
+    };
     return controls.addCheckbox(parent, "Show as frusta", state, (isOn) => {
       fileCameras.showFrusta(isOn);
     });

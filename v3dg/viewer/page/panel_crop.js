@@ -1,4 +1,4 @@
-// The panel's folder that crops an asset by a box and saves the part as a new asset.
+// The panel's folder for cropping an asset by a box, and saving the part as a new asset.
 
 import * as controls from "./controls.js";
 import { make } from "./elements.js";
@@ -7,8 +7,8 @@ import { make } from "./elements.js";
 /** @typedef {import("./protocol.js").Crop} CropMessage */
 
 const PARTS = [
-  ["inside", "Keep what is inside"],
-  ["outside", "Delete what is inside"],
+  ["inside", "Keep the inside"],
+  ["outside", "Delete the inside"],
 ];
 
 export class CropFolder {
@@ -21,7 +21,7 @@ export class CropFolder {
     const { crop } = app;
     this.text = controls.addFaintText(parent);
     const row = controls.addRow(parent);
-    const title = "A box around the selected instance, whose faces can be dragged";
+    const title = "Draw a box around the selected instance; its faces can be dragged";
     controls.addButton(row, "Draw a box", () => crop.begin(), title);
     controls.addButton(row, "Remove the box", () => crop.end(), "Esc");
     this.options = make("div");
@@ -34,17 +34,24 @@ export class CropFolder {
     this.name.addEventListener("input", () => {
       crop.name = this.name.value;
     });
-    controls.addLabelled(this.options, "New file", this.name, "Its end is the format");
+    controls.addLabelled(
+      this.options,
+      "New file",
+      this.name,
+      "The end of the name selects the format",
+    );
     const place = app.scene.writes_files
-      ? "Beside the file that is shown; no file is ever overwritten"
-      : "Where the browser saves files";
+      ? "Saved beside the file that is shown; existing files are not overwritten"
+      : "Saved by the browser";
     controls.addButton(this.options, "Save as a new asset", () => crop.save(), place);
   }
 
   sync() {
     const { crop } = this.app;
     this.options.hidden = !crop.isOn;
-    this.text.textContent = crop.isOn ? crop.text : "crop or delete by a box, as a new asset";
+    this.text.textContent = crop.isOn
+      ? crop.text
+      : "keep or delete the inside of a box, as a new asset";
     this.part.set(crop.keep);
     if (document.activeElement !== this.name) this.name.value = crop.name;
   }

@@ -1,4 +1,4 @@
-// The panel's folder "Picture": what is shown, and how finely.
+// The panel's folder "Picture": the content and the quality of pictures.
 
 import { colorOf, hexOf } from "./colors.js";
 import { addButton, addCheckbox, addColor, addRow, addSelect, addSlider } from "./controls.js";
@@ -7,7 +7,7 @@ import { make } from "./elements.js";
 /** @typedef {import("./app.js").App} App */
 /** @typedef {import("./protocol.js").Shows} Shows */
 
-/** Names of what can be shown. */
+/** Names of the display modes. */
 const NAMES = /** @type {Record<Shows, string>} */ ({
   appearance: "Colour",
   level: "Level",
@@ -19,13 +19,13 @@ const NAMES = /** @type {Record<Shows, string>} */ ({
   count: "Gaussians per pixel",
   difference: "Difference to all gaussians",
 });
-/** What there is to see only if there are levels. */
+/** Modes that are useful only if there are levels. */
 const OF_LEVELS = /** @type {Shows[]} */ (["level", "error", "difference"]);
-/** Ends of the sliders, where no setting lies beyond. */
+/** Ends of the sliders, unless a setting is beyond them. */
 const MOST_TOLERANCE = 32;
 const LEAST_MILLIONS = 0.01;
 const MOST_MILLIONS = 20;
-/** Limit when one is first wished for. */
+/** Number of millions of gaussians when the limit is switched on. */
 const FIRST_MILLIONS = 2;
 
 export class PictureFolder {
@@ -50,7 +50,7 @@ export class PictureFolder {
     this.resolution = this.addResolution(parent);
     this.background = this.addBackground(parent);
     const save = () => app.path.save("picture");
-    addButton(addRow(parent), "Save picture", save, "A .png of what is shown, in full");
+    addButton(addRow(parent), "Save picture", save, "Save the picture at full quality as a .png");
   }
 
   get settings() {
@@ -78,7 +78,7 @@ export class PictureFolder {
 
   /** @param {HTMLElement} parent */
   addBackground(parent) {
-    const title = "What is seen where no gaussian is.";
+    const title = "The colour behind the gaussians.";
     const state = { value: hexOf(this.settings.background), title };
     return addColor(parent, "Background", state, (color) => {
       this.app.change({ background: colorOf(color) });
@@ -110,14 +110,15 @@ export class PictureFolder {
   /** @param {HTMLElement} parent */
   addTolerance(parent) {
     const value = this.settings.tolerance;
-    const title = "Screen area that one gaussian of a coarser cluster may stand for; 0 draws all.";
+    const title =
+      "Largest screen area that one gaussian of a coarser cluster may stand for; 0 draws all.";
     const range = { low: 0, high: Math.max(MOST_TOLERANCE, value), step: 0.25, value, title };
     return addSlider(parent, "Tolerance px²", range, (tolerance) => this.app.change({ tolerance }));
   }
 
   /** @param {HTMLElement} parent */
   addLimit(parent) {
-    const title = "The tolerance is raised until no more than so many are selected.";
+    const title = "Raise the tolerance until at most this number of gaussians is selected.";
     const state = { value: this.settings.budget !== null, title };
     return addCheckbox(parent, "Limit gaussians", state, (isLimited) => {
       if (isLimited) this.app.change({ budget: 1e6 * FIRST_MILLIONS, tolerance: 0 });
@@ -125,7 +126,10 @@ export class PictureFolder {
     });
   }
 
-  /** A tolerance of 0, which goes with a limit, would draw everything without one. */
+  /**
+   * With a limit, the tolerance is usually 0, which would draw all gaussians when the limit is
+   * removed.
+   */
   get toleranceWithoutLimit() {
     return this.settings.tolerance || this.app.greeting.defaults.tolerance;
   }
@@ -159,7 +163,7 @@ export class PictureFolder {
 
   /** @param {HTMLElement} parent */
   addFade(parent) {
-    const title = "A level comes as the other goes, so that nothing pops while the camera moves.";
+    const title = "Blend between levels, so that nothing pops while the camera moves.";
     const state = { value: this.settings.fade !== null, title };
     return addCheckbox(parent, "Fade", state, (isOn) => {
       this.app.change({ fade: isOn ? this.app.greeting.defaults.fade : null });
@@ -168,14 +172,14 @@ export class PictureFolder {
 
   /** @param {HTMLElement} parent */
   addSplit(parent) {
-    const title = "All gaussians on the left, the cut on the right.";
+    const title = "Show all gaussians on the left and the cut on the right.";
     const range = { low: 0, high: 1, step: 0.01, value: this.settings.split, title };
     return addSlider(parent, "Split", range, (split) => this.app.change({ split }));
   }
 
   /** @param {HTMLElement} parent */
   addFreeze(parent) {
-    const title = "Keep what this camera needs, and fly around it.";
+    const title = "Keep the cut of this camera while you fly around.";
     const state = { value: this.settings.frozen !== null, title };
     return addCheckbox(parent, "Freeze the cut", state, (isOn) => {
       this.app.change({ frozen: isOn ? this.app.look.view : null });
@@ -185,7 +189,8 @@ export class PictureFolder {
   /** @param {HTMLElement} parent */
   addResolution(parent) {
     const { look } = this.app;
-    const title = "Of the window, at rest; while moving it follows the speed.";
+    const title =
+      "Resolution at rest, relative to the window. While the camera moves, it depends on the drawing speed.";
     const range = { low: 10, high: 100, step: 5, value: 100 * look.resolution, title };
     return addSlider(parent, "Resolution %", range, (percent) => {
       look.resolution = percent / 100;

@@ -1,4 +1,4 @@
-// The panel's folders about the selected instance, and about paths and what is saved.
+// The panel's folders about the selected instance, and about paths and saving.
 
 import * as controls from "./controls.js";
 import { make } from "./elements.js";
@@ -18,7 +18,7 @@ export class InstancesFolder {
     const row = controls.addRow(parent);
     controls.addButton(row, "Undo", () => app.instances.undo(), "Ctrl+Z");
     if (app.scene.has_files) {
-      const title = "The instances as they stand now, with the path's cameras";
+      const title = "Save the current instances and the cameras of the path";
       controls.addButton(row, "Save scene (.json)", () => app.path.save("scene"), title);
     }
   }
@@ -51,7 +51,7 @@ export class PathFolder {
     const { path } = app;
     this.text = controls.addFaintText(parent);
     const range = { low: 0.5, high: 10, step: 0.5, value: path.secondsOfNextStop };
-    controls.addSlider(parent, "Seconds a view", range, (seconds) => {
+    controls.addSlider(parent, "Seconds per view", range, (seconds) => {
       path.secondsOfNextStop = seconds;
     });
     const row = controls.addRow(parent);
@@ -77,7 +77,7 @@ export class PathFolder {
   /** @param {HTMLElement} parent */
   addRecording(parent) {
     const { path } = this.app;
-    const state = { value: false, title: "Keep every view while you fly." };
+    const state = { value: false, title: "Record every view while you fly." };
     return controls.addCheckbox(parent, "Record", state, (isOn) => {
       if (isOn) path.startRecording();
       else path.stopRecording();

@@ -8,31 +8,33 @@ import * as M from "./math.js";
 /** @typedef {import("./protocol.js").View} View */
 
 const RECORDED_A_SECOND = 30;
-/** The viewer takes no two views at the same time. */
+/** Minimum time between two views, because the viewer does not accept equal times. */
 const LEAST_SECONDS = 0.01;
-/** Name of the film's size that is the window's; all others are like "1280 x 720". */
+/**
+ * Name of the size of a film that equals the size of the window. All other names are like "1280 x
+ * 720".
+ */
 export const AS_THE_WINDOW = "as the window";
 
 export class CameraPath {
   /**
-   * Views, each with the seconds from the one before.
-   *
-   * @type {[number, View][]}
+   * Views, each with the seconds since the previous view.
    */
   stops = [];
-  /** Seconds from the view before to the one that is added next. */
+  /** Seconds between the last view and the one that is added next. */
   secondsOfNextStop = 2;
   /** Width and height of films, px, or `AS_THE_WINDOW`. */
   filmSize = "1280 x 720";
   isRecording = false;
   /**
-   * When a view was last recorded, ms; null for the first.
+   * Time at which a view was last recorded, ms; null before the first one.
    *
    * @type {number}
    */
   recordedAt = null;
   /**
-   * The views that are played, and since when, ms; null while none are.
+   * The views that are played, and the time at which playback started, ms; null if nothing is
+   * played.
    *
    * @type {Play & { start: number }}
    */
@@ -43,7 +45,7 @@ export class CameraPath {
     this.app = app;
   }
 
-  /** Forgets the path of another scene. */
+  /** Removes the path when another scene is opened. */
   reset() {
     this.stops = [];
   }
@@ -52,7 +54,7 @@ export class CameraPath {
     return this.film !== null;
   }
 
-  /** Seconds from the first view to the last. */
+  /** Duration from the first to the last view in seconds. */
   get duration() {
     return sumOfSeconds(this.stops.slice(1));
   }
@@ -70,7 +72,7 @@ export class CameraPath {
     this.app.sync();
   }
 
-  /** Records every view from now on, in place of the path before. */
+  /** Starts recording views, after removing the previous path. */
   startRecording() {
     this.stops = [];
     this.recordedAt = null;
@@ -79,7 +81,7 @@ export class CameraPath {
   }
 
   stopRecording() {
-    this.record(performance.now()); // so that the path ends where the camera rests
+    this.record(performance.now()); // the path ends with the present view
     this.isRecording = false;
     this.app.sync();
   }
@@ -116,20 +118,20 @@ export class CameraPath {
     if (!this.film) return;
     const { views, fps, start } = this.film;
     const end = views.length - 1;
-    // The time of a frame may be a little before the message that came in it.
+    // The time of a frame may be slightly before the arrival of the message.
     const place = M.clamp(((now - start) / 1000) * fps, 0, end);
     this.app.camera.put(views[Math.floor(place)]);
     if (place >= end) this.film = null;
   }
 
-  /** Ends playing and saving. */
+  /** Stops playing and saving. */
   stop() {
     this.film = null;
     this.app.connection.send({ type: "stop" });
   }
 
   /**
-   * Asks for a file of the picture, the scene, or the path, or for the path's views to play.
+   * Requests a file of the picture, the scene or the path, or the views of the path for playback.
    *
    * @param {Save["what"]} what
    */
@@ -137,7 +139,7 @@ export class CameraPath {
     const { app } = this;
     const most = app.limits.path_seconds;
     if (sumOfSeconds(this.stops) > most) {
-      app.status.warn(`Path: expected at most ${most / 60} minutes, got more; clear it`);
+      app.status.warn(`Path: expected at most ${most / 60} minutes, got more; clear the path`);
       return;
     }
     const look = structuredClone(app.look.message);

@@ -1,4 +1,4 @@
-// The last picture that came, which follows the camera until the next one comes.
+// The last picture. It is transformed to follow the camera until the next picture arrives.
 
 import * as M from "./math.js";
 import { element } from "./elements.js";
@@ -6,19 +6,19 @@ import { element } from "./elements.js";
 /** @typedef {import("./app.js").App} App */
 /** @typedef {import("./protocol.js").Picture} PictureMessage */
 
-/** The figures of drafts change no more often than this. */
+/** Minimum time between two updates of the statistics for drafts. */
 const FIGURES_MS = 200;
 
 export class Picture {
   canvas = /** @type {HTMLCanvasElement} */ (element("picture"));
   context = this.canvas.getContext("bitmaprenderer");
   /**
-   * What came with the picture that is shown; null before the first one.
+   * The message of the picture that is shown; null before the first picture.
    *
    * @type {PictureMessage}
    */
   message = null;
-  /** When the figures were last shown, ms. */
+  /** Time at which the statistics were last updated, ms. */
   figuresAt = -Infinity;
 
   /** @param {App} app */
@@ -32,7 +32,7 @@ export class Picture {
    */
   async show(message, bytes) {
     const { app } = this;
-    // A second picture for what is no longer looked at was under way when the camera moved.
+    // A further picture for an old request may still arrive after the camera has moved.
     const isLate = message.number !== app.requests.number;
     if (isLate && message.number === this.message?.number) return;
     const bitmap = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
@@ -53,7 +53,7 @@ export class Picture {
     app.redraw();
   }
 
-  /** Says whether the picture is the one that was asked for last, and in full. */
+  /** Displays whether the picture is the final one of the last request. */
   sayState() {
     if (!this.message) return;
     const { status, requests, look } = this.app;
@@ -69,7 +69,7 @@ export class Picture {
     else status.say("refining", `refining, ${size}`);
   }
 
-  /** Puts the picture where it would be seen from the camera's present place. */
+  /** Transforms the picture to where it would appear from the present camera. */
   place() {
     if (!this.message) return;
     const { camera, look } = this.app;

@@ -1,4 +1,5 @@
-// Where the camera can go: the whole scene, a point, an instance, a camera; and what is up.
+// Places for the camera: the whole scene, a point, an instance, a camera of the file; and the up
+// axis.
 
 import * as M from "./math.js";
 import { AXES } from "./camera.js";
@@ -8,10 +9,10 @@ import { AXES } from "./camera.js";
 /** @typedef {import("./page.js").Pinhole} Pinhole */
 /** @typedef {import("./page.js").Vector} Vector */
 
-/** Cosine of the angle below which two directions are the same. */
+/** Directions count as equal if the cosine of the angle between them exceeds this value. */
 const SAME_DIRECTION = 0.9999;
 const HOME_FOV_Y = Math.PI / 4;
-/** Angle to the horizon at which the whole scene is looked at, radians. */
+/** Angle above the horizon for a view of the whole scene, radians. */
 const HOME_PITCH = 0.45;
 
 export class Places {
@@ -21,7 +22,7 @@ export class Places {
   }
 
   /**
-   * The axis that is up; null if it is none of the world's.
+   * The up axis; null if the up direction is not a world axis.
    *
    * @returns {Axis | null}
    */
@@ -38,14 +39,14 @@ export class Places {
     this.app.sync();
   }
 
-  /** Stands upright again. */
+  /** Turns the camera upright. */
   level() {
     this.app.camera.level();
     this.app.redraw();
   }
 
   /**
-   * The first view of the scene: all of an object, a room from inside.
+   * The first view of the scene, which shows all of an object, or a room from inside.
    *
    * @returns {Pinhole}
    */
@@ -55,12 +56,15 @@ export class Places {
     return isUpAsSaid ? this.firstHome.view : this.homeFromAbove;
   }
 
-  /** The point that orbits go around at first. */
+  /** The point around which the camera of the first view orbits. */
   get homeFocus() {
     return this.home === this.firstHome.view ? this.firstHome.focus : this.app.scene.center;
   }
 
-  /** The widest first view that fits into the window, else the narrowest one. */
+  /**
+   * The first view for the widest window that is not wider than this window, or else for the
+   * narrowest.
+   */
   get firstHome() {
     const { homes } = this.app.scene;
     const fitting = homes.filter(({ view }) => view.aspect <= this.app.look.aspect);
@@ -68,7 +72,7 @@ export class Places {
   }
 
   /**
-   * A view of all of the scene, from a little above, for an axis that a person chose.
+   * A view of the whole scene from slightly above, for an up axis that the user chose.
    *
    * @returns {Pinhole}
    */
@@ -77,7 +81,7 @@ export class Places {
     const side = M.unit(M.cross(camera.up, M.axisAcross(camera.up)));
     const level = M.mul(side, Math.cos(HOME_PITCH));
     const forward = M.add(level, M.mul(camera.up, -Math.sin(HOME_PITCH)));
-    // A window that is higher than wide shows less at its sides.
+    // In a window that is higher than wide, the horizontal field of view is the smaller one.
     const half = Math.atan(Math.tan(HOME_FOV_Y / 2) * Math.min(1, look.aspect));
     const distance = (0.95 * scene.radius) / Math.sin(half);
     const position = M.sub(scene.center, M.mul(forward, distance));
@@ -90,7 +94,8 @@ export class Places {
   }
 
   /**
-   * Flies to what a person wrote: x y z, # and an instance's number, or a camera's name.
+   * Flies to a place that the user typed: x y z, # and the number of an instance, or the name of a
+   * camera.
    *
    * @param {string} text
    */

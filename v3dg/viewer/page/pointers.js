@@ -1,4 +1,5 @@
-// Mouse and touch: drags turn the camera or move an instance, clicks pick, the wheel approaches.
+// Mouse and touch: drags turn the camera or move an instance, clicks pick, and the wheel changes
+// the distance.
 
 import * as M from "./math.js";
 
@@ -6,28 +7,28 @@ import * as M from "./math.js";
 /** @typedef {import("./page.js").Place} Place */
 /** @typedef {{ x: number, y: number, time: number, hasMoved: boolean, button: number }} Press */
 
-/** A press that moves less and is shorter is a click. */
+/** A press that moves less than this and is shorter than this is a click. */
 const CLICK_PX = 5;
 const CLICK_MS = 500;
-/** A click so near and so soon after another one is a double click. */
+/** A click this close to the previous one, and within this time, is a double click. */
 const DOUBLE_CLICK_PX = 12;
 const DOUBLE_CLICK_MS = 400;
-/** How near to a handle a press has to be, px. */
+/** Largest distance between a press and a handle, px. */
 const SLACK_OF_TOUCH = 24;
 const SLACK_OF_MOUSE = 11;
-/** Px of a line, for wheels that scroll by lines. */
+/** Number of px per line, for wheels that scroll by lines. */
 const LINE_PX = 33;
 const MOST_WHEEL_PX = 300;
 
 export class Pointers {
   /**
-   * Places of the mouse with its button held, or of fingers, by the pointer's id.
+   * Positions of the mouse while its button is pressed, or of fingers, by the pointer's id.
    *
    * @type {Map<number, Place>}
    */
   places = new Map();
   /**
-   * Where and how the first of them was pressed; null before the first press.
+   * The first press of these pointers; null before any press.
    *
    * @type {Press}
    */
@@ -73,7 +74,7 @@ export class Pointers {
     instances.grip = null;
     crop.grip = null;
     if (this.places.size > 1) {
-      this.start.hasMoved = true; // two fingers are no click
+      this.start.hasMoved = true; // a press with two fingers is not a click
       return;
     }
     this.start = { x, y, time: performance.now(), hasMoved: false, button };
@@ -96,15 +97,15 @@ export class Pointers {
     else if (app.crop.grip) app.crop.drag(x, y);
     else if (app.instances.grip) app.instances.setPose(app.overlay.handles.drag(x, y));
     else if (this.start.hasMoved) this.drag(x - before[0], y - before[1], event.shiftKey);
-    else return; // it may be a click
+    else return; // may still be a click
     this.places.set(event.pointerId, [x, y]);
     app.redraw();
   }
 
   /**
-   * Two fingers move sideways, and approach as they are spread.
+   * Moving two fingers moves the camera sideways; spreading them moves it closer.
    *
-   * @param {number} pointerId Of the finger that moves.
+   * @param {number} pointerId Id of the finger that moves.
    * @param {Place} before
    * @param {Place} now
    */
@@ -134,7 +135,7 @@ export class Pointers {
   }
 
   /**
-   * Moves the camera sideways, so that what is at the focus follows the pointer.
+   * Moves the camera sideways, so that the focus follows the pointer.
    *
    * @param {number} dx
    * @param {number} dy

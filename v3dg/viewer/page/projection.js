@@ -1,4 +1,4 @@
-// Where points of the world are in the picture, and lines between them.
+// Projects points of the world into the picture, and draws lines between them.
 
 import * as M from "./math.js";
 
@@ -7,7 +7,7 @@ import * as M from "./math.js";
 /** @typedef {import("./page.js").Vector} Vector */
 /** @typedef {[Vector, Vector]} Line */
 
-/** What is nearer to the camera is not drawn; in radii of the scene. */
+/** Points and lines closer to the camera than this are not drawn; in radii of the scene. */
 const NEAREST_POINT = 1e-6;
 const NEAREST_OF_LINE = 1e-4;
 
@@ -18,7 +18,7 @@ export class Projection {
 
   /**
    * @param {Camera} camera
-   * @param {CanvasRenderingContext2D} context That lines are drawn into.
+   * @param {CanvasRenderingContext2D} context The context for drawing lines.
    */
   constructor(camera, context) {
     this.camera = camera;
@@ -31,7 +31,7 @@ export class Projection {
   }
 
   /**
-   * A point to the right, down and ahead of the camera.
+   * Returns a point in the camera's coordinates: right, down and forward.
    *
    * @param {Vector} point
    */
@@ -40,7 +40,7 @@ export class Projection {
   }
 
   /**
-   * @param {Vector} point In the camera's coordinates, ahead of it.
+   * @param {Vector} point A point in the camera's coordinates, in front of it.
    * @returns {Place}
    */
   project([x, y, z]) {
@@ -48,7 +48,7 @@ export class Projection {
   }
 
   /**
-   * Where a point is in the picture; null behind the camera.
+   * Returns the place of a point in the picture; null if it is behind the camera.
    *
    * @param {Vector} point
    */
@@ -59,7 +59,8 @@ export class Projection {
   }
 
   /**
-   * The direction from the camera to a place of the picture, in the world, of any length.
+   * Returns the direction of the ray through a place in the picture, in the world; its length is
+   * arbitrary.
    *
    * @param {Place} place
    */
@@ -83,7 +84,7 @@ export class Projection {
     context.stroke();
   }
 
-  /** @param {Line} line Of which what is behind the camera is left out. */
+  /** @param {Line} line A line, of which only the part in front of the camera is drawn. */
   addLine([start, end]) {
     const near = NEAREST_OF_LINE * this.camera.radius;
     let p = this.inCamera(start);

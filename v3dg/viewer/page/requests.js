@@ -1,24 +1,24 @@
-// Asks for pictures, each time that what is looked at has changed.
+// Requests pictures whenever the view or the settings have changed.
 
 /** @typedef {import("./app.js").App} App */
 
-/** The camera rests when nothing has changed for so long. */
+/** The camera counts as resting if nothing has changed for this time. */
 const REST_MS = 250;
 
 export class Requests {
-  /** Number of the last request, which its pictures bear. */
+  /** Number of the last request, which its pictures repeat. */
   number = 0;
   /**
-   * The last request as JSON, which the next one is compared with; null to ask again.
+   * The last request as JSON, with which the next one is compared; null to request again.
    *
    * @type {string}
    */
   asked = null;
-  /** Whether what is looked at has changed in the last `REST_MS`. */
+  /** Whether anything has changed in the last `REST_MS`. */
   isMoving = false;
-  /** When it began to change, ms. */
+  /** Time at which the present movement began, ms. */
   movedAt = 0;
-  /** The timer that ends the movement. */
+  /** The timer that ends a movement. */
   restTimer = 0;
 
   /** @param {App} app */
@@ -26,12 +26,12 @@ export class Requests {
     this.app = app;
   }
 
-  /** Forgets what was asked for, because the server may not know it or has changed the scene. */
+  /** Forgets the last request, because the server may not know it or may have changed the scene. */
   reset() {
     this.asked = null;
   }
 
-  /** Says that the picture that is shown is of a scene that has changed. */
+  /** Marks the picture that is shown as outdated, because the scene has changed. */
   expire() {
     this.reset();
     this.number += 1;
@@ -39,7 +39,7 @@ export class Requests {
   }
 
   /**
-   * Asks for a picture if another one is wanted than was asked for last.
+   * Requests a picture if the view or the settings differ from the last request.
    *
    * @param {number} now
    */
@@ -48,7 +48,7 @@ export class Requests {
     const { message } = app.look;
     const text = JSON.stringify(message);
     if (text !== this.asked) {
-      app.redraw(); // until it is sent
+      app.redraw(); // tries again until the request is sent
       if (!app.connection.isFree) return;
       this.number += 1;
       app.connection.send({ ...message, number: this.number });

@@ -1,4 +1,4 @@
-// What the page says of itself: the line below the picture, and notices above it.
+// Messages of the page: the line below the picture, and notices above it.
 
 import { element, make } from "./elements.js";
 
@@ -19,17 +19,17 @@ export class Status {
     element("status").textContent = text;
   }
 
-  /** @param {number} share Width of the picture, as a share of that of the full one. */
+  /** @param {number} share Width of the picture as a fraction of the full width. */
   showRefined(share) {
     this.refinedBar.style.width = `${100 * share}%`;
   }
 
-  /** @param {string} text What went wrong. */
+  /** @param {string} text A description of the problem. */
   warn(text) {
     this.addNotice(text, "");
   }
 
-  /** @param {string} text What was done. */
+  /** @param {string} text A description of the action. */
   confirm(text) {
     this.addNotice(text, "good");
   }

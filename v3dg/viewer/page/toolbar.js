@@ -1,4 +1,4 @@
-// The buttons over the picture, and the one that folds the panel.
+// The buttons over the picture, and the button that opens and closes the panel.
 
 import { AXES, isMode } from "./camera.js";
 import { element, make } from "./elements.js";
@@ -7,7 +7,7 @@ import { element, make } from "./elements.js";
 /** @typedef {import("./page.js").Axis} Axis */
 /** @typedef {import("./page.js").Tool} Tool */
 
-/** Windows in which the panel lies over the picture; style.css has the same. */
+/** Media query for windows in which the panel covers the picture; the same as in style.css. */
 const SMALL_WINDOW = "(max-width: 700px), (max-height: 480px)";
 
 export class Toolbar {
@@ -27,7 +27,7 @@ export class Toolbar {
     if (matchMedia(SMALL_WINDOW).matches) this.foldPanel();
   }
 
-  /** Adds a button for each axis to the question what is up. */
+  /** Adds a button for each axis to the question which way is up. */
   addAxes() {
     for (const axis of Object.keys(AXES)) {
       const attributes = { role: "radio", "data-up": axis, title: `${axis} is up` };
@@ -35,7 +35,7 @@ export class Toolbar {
     }
   }
 
-  /** @param {DOMStringMap} data Of the button. */
+  /** @param {DOMStringMap} data The data attributes of the button. */
   press({ mode, tool, up, act }) {
     const { app } = this;
     if (isMode(mode)) app.setMode(mode);
@@ -58,7 +58,7 @@ export class Toolbar {
     app.sync();
   }
 
-  /** Shows which mode, tool and axis are chosen. */
+  /** Updates which mode, tool and axis are marked as chosen. */
   sync() {
     const { camera, instances, places } = this.app;
     check("mode", camera.mode);
@@ -84,7 +84,7 @@ export class Toolbar {
 }
 
 /**
- * Checks the button whose attribute `data-…` has a value, and no other one.
+ * Marks the button whose attribute `data-…` has a value as chosen, and no other button.
  *
  * @param {"mode" | "tool" | "up"} name
  * @param {string | null} value
