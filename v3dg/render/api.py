@@ -81,11 +81,11 @@ def render(
     Args:
         subject: What to draw, in world space; or its file, which every call opens
             again.
-        camera: Its model may be any. With several, each has its own cut and its own
+        camera: Camera of any model. With several, each has its own cut and its own
             picture, as if drawn alone. The two eyes of a stereo camera share one cut
             and one frame. Their two pictures have common statistics, which are sums,
-            except for the number of selected gaussians. None means the first camera of a scene's
-            file, else the camera of `first_camera`.
+            except for the number of selected gaussians. None means the first camera of
+            a scene's file, else the camera of `first_camera`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
