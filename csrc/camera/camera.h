@@ -95,8 +95,8 @@ namespace v3dg {
 enum class LensModel { pinhole, opencv, fisheye };
 
 // A camera of any model: the fields of a pinhole, and the parameters of its lens, which
-// only the model reads. Its members call those of the model. Loops that draw many
-// gaussians use visit() outside of the loop, so that pinholes do not pay for the choice.
+// only the model reads. Its members call those of the model. Loops over gaussians use
+// visit() outside of the loop, so that pinholes do not pay for the choice.
 template <class T>
 struct Intrinsics : Pinhole<T> {
     using Limits = SlopeLimits<T>;
@@ -244,7 +244,7 @@ inline Intrinsics<double> intrinsics_of_fisheye(const Pinhole<double>& projectio
 // requested part of its image.
 struct Camera : CameraPose, Intrinsics<double>, ImagePart {
     // px2_per_steradian() of the camera model, which selection needs for each instance.
-    // It is not set for pinholes.
+    // Not used for pinholes.
     double density;
 
     // Returns the camera model with scalar type T.

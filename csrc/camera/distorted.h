@@ -5,8 +5,8 @@
 //
 // The image of a distorted camera is measured in units of its focal lengths, from its
 // principal point: a pixel (u, v) is at ((u - cx) / fx, (v - cy) / fy), and its radius
-// is its distance from (0, 0). A direction at the angle theta from the camera's axis has
-// an image whose radius is at least low(theta), an increasing function.
+// is its distance from (0, 0). A direction at the angle theta from the camera's axis
+// has an image whose radius is at least low(theta), an increasing function.
 //
 // Culling. Let a gaussian have its mean at the angle theta and the distance n from the
 // eye, and let d be any vector from its mean to its ellipsoid. The image is linearised
@@ -24,8 +24,8 @@
 // model's range. Means beyond that range are not drawn at all. A box contains the means
 // of its gaussians, and their ellipsoids, which are symmetrical: so |d| is at most half
 // of the diagonal of the box, and N . p is at least that of the nearest corner. The
-// planes have the normals (±1, 0, -slope) and (0, ±1, -slope) with slope = tan(theta_w),
-// whose length is sqrt(1 + slope²).
+// planes have the normals (±1, 0, -slope) and (0, ±1, -slope) with slope =
+// tan(theta_w), whose length is sqrt(1 + slope²).
 
 #include <cmath>
 
@@ -59,8 +59,8 @@ struct Distorted : Pinhole<T> {
         a1 = at.j1[0] * x + at.j1[1] * y + at.j1[2] * z;
         a2 = at.j2[0] * x + at.j2[1] * y + at.j2[2] * z;
     }
-    // A guard is per half of the diagonal of a box, which is at most the sum of its half
-    // extents.
+    // A guard is per half of the diagonal of a box, which is at most the sum of its
+    // half extents.
     static V3DG_HD void set_guard_direction(const InstanceAxes&, float direction[3]) {
         for (int k = 0; k < 3; ++k) direction[k] = 1;
     }

@@ -15,8 +15,8 @@
 // min(R, R + 2 r² R') - 6 |q| r. Where that is positive in a disc, the map is one to
 // one, and the radius of an image is at least low(r) = r R - 3 |q| r², which increases.
 // That disc is the valid range; points outside, beyond the first fold, are not drawn.
-// The Jacobian is that at the slopes, moved towards the axis where they are farther than
-// kFovMargin outside of the image, as for a pinhole.
+// The Jacobian is that at the slopes, moved towards the axis where they are farther
+// than kFovMargin outside of the image, as for a pinhole.
 
 #include "camera/distorted.h"
 
@@ -78,7 +78,7 @@ struct OpenCv : Distorted<T> {
         const V shrink = shrink_of(r2);
         V d_x, d_y;
         jacobian_vjp(inv_z, shrink * x, shrink * y, d_j1, d_j2, d_x, d_y);
-        // Clamped slopes move only around the axis: the part along them has no gradient.
+        // Clamped slopes move only around the axis, so their length has no gradient.
         const V along = r2 > all_lanes<V>(clamp_slope * clamp_slope)
                             ? (x * d_x + y * d_y) / max_of(r2, all_lanes<V>(kTiny))
                             : V{};
@@ -94,8 +94,8 @@ struct OpenCv : Distorted<T> {
         d_p[2] = d.depth - inv_z * (dot3(at.j1, d_j1) + dot3(at.j2, d_j2) + x * d_x + y * d_y);
     }
 
-    // The density at the axis of a pinhole, times a bound on the determinant of D in the
-    // image. As for a pinhole, the growth of the density away from the axis that comes
+    // The density at the axis of a pinhole, times a bound on the determinant of D in
+    // the image. As for a pinhole, the growth of the density away from the axis that comes
     // from the slopes alone is ignored.
     V3DG_HD T px2_per_steradian() const {
         const double most = first_reaching(radius_of_image(*this), double(valid_slope),
