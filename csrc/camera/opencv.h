@@ -95,8 +95,8 @@ struct OpenCv : Distorted<T> {
     }
 
     // The density at the axis of a pinhole, times a bound on the determinant of D in
-    // the image. As for a pinhole, the growth of the density away from the axis that comes
-    // from the slopes alone is ignored.
+    // the image. As for a pinhole, the growth of the density away from the axis that
+    // comes from the slopes alone is ignored.
     V3DG_HD T px2_per_steradian() const {
         const double most = first_reaching(radius_of_image(*this), double(valid_slope),
                                            [&](double r) { return lowest_radius(r); });

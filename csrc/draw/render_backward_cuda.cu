@@ -1,3 +1,5 @@
+// Pictures of one model with their backward pass, and idle frames for the next ones.
+
 #include "draw/render_backward_cuda.h"
 
 #include <map>
