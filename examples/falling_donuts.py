@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 import v3dg
 
-# So that benchmarks/ of this checkout can be imported.
+# The checkout is on the path, so that `benchmarks` can be imported.
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from benchmarks.worlds import donut_shower
 from benchmarks.worlds.procedural import make_donut

@@ -14,6 +14,7 @@ if _find_spec("v3dg._core") is None:
 
 from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
+from v3dg.camera_batch import CameraBatch
 from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, StereoCamera, turntable
 from v3dg.editing import (
@@ -35,7 +36,7 @@ from v3dg.panorama import draw_panorama
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize
 from v3dg.refine import refine_bundle
-from v3dg.render import Renderer, first_camera, render
+from v3dg.render import BatchPlanes, RenderedBatch, Renderer, first_camera, render
 from v3dg.scene import Scene
 from v3dg.scene.file import read_scene, write_scene
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
@@ -62,6 +63,7 @@ __all__ += [
     "Renderer",
     "Stats",
 ]
+__all__ += ["BatchPlanes", "CameraBatch", "RenderedBatch"]
 __all__ += ["draw_panorama", "first_camera"]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]
 __all__ += ["read_usd_scene", "write_site", "write_streamed_sog", "write_tiles", "write_usd"]

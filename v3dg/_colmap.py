@@ -100,7 +100,7 @@ class Lens:
     @property
     def is_distorted(self) -> bool:
         if self.model.name == "EUCM":
-            # If this is 0, the other parameter has no effect.
+            # If the first parameter is 0, the second one has no effect.
             return self.distortion[0] != 0
         return any(self.distortion)
 
@@ -211,7 +211,11 @@ def _num_parameters(model: _Model) -> int:
 
 def _take(path: Path, file: IO[bytes], size: int) -> bytes:
     content = file.read(size)
-    check(path, len(content) == size, f"{size} more bytes, got the end of the file")
+    check(
+        path,
+        len(content) == size,
+        f"{size} more bytes, got the end of the file; is the file complete?",
+    )
     return content
 
 
@@ -223,7 +227,8 @@ def _count(path: Path, file: IO[bytes], least_bytes: int) -> int:
     check(
         path,
         count <= num_bytes // least_bytes,
-        f"{count} entries, got a file of {num_bytes} bytes; is it complete?",
+        f"at least {count * least_bytes} bytes for {count} entries, got a file of "
+        f"{num_bytes} bytes; the file is incomplete or damaged",
     )
     return int(count)
 
@@ -247,7 +252,7 @@ def _binary_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
         num_points = _count(path, file, 1)
         position = file.seek(_POINT_BYTES * num_points, os.SEEK_CUR)
         expected = f"{num_points} points of image {number}"
-        check(path, position <= end, f"{expected}, got the end of the file")
+        check(path, position <= end, f"{expected}, got the end of the file; is the file complete?")
         yield _ImageEntry(number, tuple(pose[:4]), tuple(pose[4:]), lens, name)
 
 

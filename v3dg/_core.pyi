@@ -489,6 +489,7 @@ class ResidentScene:
         quaternions: Array,
         scales: Array,
         factors: Float32 | None = None,
+        environments: Int32 | None = None,
     ) -> None: ...
     def set_poses(self, positions: Array, quaternions: Array, scales: Array) -> None: ...
     def select(
@@ -584,6 +585,72 @@ class Shade:
     def __init__(
         self, *, background: Sequence[float], min_transmittance: float, with_depth: bool
     ) -> None: ...
+    @property
+    def with_depth(self) -> bool: ...
+
+class Cameras:
+    """The cameras of a batch; borrows the arrays.
+
+    Args:
+        viewmats: (B, 4, 4).
+        K: (B, 3, 3), or (3, 3) for all.
+        environments: (B,), or None where each camera sees all instances.
+    """
+
+    def __init__(
+        self,
+        *,
+        viewmats: Array,
+        K: Array,
+        width: int,
+        height: int,
+        near: float,
+        environments: Array | None = None,
+    ) -> None: ...
+    def __len__(self) -> int: ...
+
+def fault_of_cameras(viewmats: Float64, K: Float64) -> tuple[int, str] | None: ...
+
+class BatchPlanes:
+    """The planes of a batch; keeps the arrays.
+
+    Args:
+        color: (B, H, W, 3 or 4).
+        alpha: (B, H, W), or None.
+        depth: (B, H, W), or None.
+    """
+
+    def __init__(
+        self, color: Array, alpha: Array | None = None, depth: Array | None = None
+    ) -> None: ...
+
+class BatchStats:
+    """The statistics of each picture of a batch."""
+
+    @property
+    def gaussians(self) -> list[int]: ...
+    @property
+    def in_frustum(self) -> list[int]: ...
+    @property
+    def select_ms(self) -> list[float]: ...
+    @property
+    def draw_ms(self) -> list[float]: ...
+    @property
+    def levels(self) -> list[list[int]]: ...
+    @property
+    def num_parts(self) -> int: ...
+
+class Batch:
+    """Pictures that have been drawn, or enqueued on a device."""
+
+    @property
+    def color(self) -> Array: ...
+    @property
+    def alpha(self) -> Array | None: ...
+    @property
+    def depth(self) -> Array | None: ...
+    def finish(self) -> None: ...
+    def stats(self) -> BatchStats: ...
 
 class GivenCut:
     """A cut that was selected earlier. Borrows the arrays.
@@ -665,6 +732,14 @@ class SceneFrame:
         steps: BudgetSteps | None = None,
         stop: Stop | None = None,
     ) -> Drawing: ...
+    def draw_batch(
+        self,
+        scene: ResidentScene,
+        cameras: Cameras,
+        rule: Rule,
+        shade: Shade,
+        planes: BatchPlanes | None = None,
+    ) -> Batch: ...
     def pick(
         self, scene: ResidentScene, request: FrameRequest, pool: PagePool | None = None
     ) -> Pick | None: ...

@@ -102,7 +102,7 @@ def missing_for_cuda() -> str | None:
 
 def describe(device: Device) -> str:
     """Return the model name of a GPU, or the instruction set of the CPU. The last bits
-    of results depend on it."""
+    of results depend on these."""
     if not device.is_cuda:
         return _core.isa()
     import torch

@@ -84,8 +84,8 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
         match = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
         if match:
             return int(match[1], 8)
-    # Without /proc, the umask can be read only by setting it. Meanwhile, files that
-    # other threads create are private.
+    # Without /proc, the umask can be read only by setting it. Files that other threads
+    # create at that moment are private.
     with _MASK_LOCK:
         mask = os.umask(0o077)
         os.umask(mask)
@@ -192,8 +192,8 @@ def check_bundle_name(path: str | os.PathLike[str]) -> None:
 def open_regular(path: str | os.PathLike[str]) -> int:
     """Open a file for reading and return its descriptor; raise ValueError for a
     directory, a device or a pipe."""
-    # With O_NONBLOCK, opening a pipe does not wait for a writer; regular files ignore
-    # it.
+    # With O_NONBLOCK, opening a pipe does not wait for a writer. The flag has no effect
+    # on regular files.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)

@@ -93,7 +93,8 @@ def read_json(path: str | os.PathLike[str]) -> Node:
 
 
 def write_json(path: str | os.PathLike[str], document: object) -> None:
-    """Write a JSON file; it replaces an existing one once it is complete."""
+    """Write a JSON file. An existing file is replaced only after the new one is
+    complete."""
     with _files.replacing(path) as temporary:
         Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 

@@ -54,7 +54,8 @@ class Judges:
                 measured_item, pipe = waiting.popleft()
                 yield measured_item, cast(R, _answer(pipe))
         except BaseException:
-            # Results that are still pending would be taken for those of later items.
+            # Results that are still pending would be taken for results of later items,
+            # so the processes are ended.
             self.close()
             raise
 

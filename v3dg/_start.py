@@ -9,7 +9,8 @@ process at once. While a command runs, Ctrl-C raises KeyboardInterrupt.
 
 from __future__ import annotations
 
-import _signal as signal  # type: ignore[import-not-found] # all but enumerations of its names
+# The module `signal` without its enumerations, which take long to import.
+import _signal as signal  # type: ignore[import-not-found]
 import importlib
 import os
 import sys
@@ -32,7 +33,7 @@ def refuse_sub_interpreter() -> None:
     The compiled module and NumPy support only the main interpreter of a process.
     Importing them in another one would wait forever.
     """
-    # Name since Python 3.13, and name before.
+    # The name of the module since Python 3.13, and its name before.
     for name in ("_interpreters", "_xxsubinterpreters"):
         try:
             interpreters = importlib.import_module(name)
@@ -54,8 +55,9 @@ def begin() -> None:
         signal.signal(signal.SIGINT, _end_at_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        # A later file must not get the descriptor of a standard stream and all output
-        # with it.
+        # The null device takes the closed descriptors from 0 to 2. Otherwise a file
+        # that is opened later could get one of them, and output would be written to
+        # that file.
         pass
     os.close(descriptor)
     for name in ("stdout", "stderr"):

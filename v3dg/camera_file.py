@@ -270,7 +270,7 @@ def _read_frame(
     if "near" in fields:
         near = fields["near"].positive()
     viewmat = node.attempt(partial(viewmat_from_blender, _rows(fields["transform_matrix"])))
-    # Each transform leads back to the world before it was applied.
+    # The product with a transform gives the camera in the world before that transform.
     for transform, scale in transforms:
         # Camera rejects values that are not finite.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -303,8 +303,8 @@ def _data_of(run: Path) -> Path:
 
 
 def _trained(file: Path) -> tuple[Floats, float]:
-    """Return the transform from the frame of a run's training to that of its data, in
-    the form of `_applied`."""
+    """Return the transform from the frame of a run's training to that of its data, as
+    `_applied` returns it."""
     top = read_json(file).some_fields(("transform", "scale"))
     matrix = _rows(top["transform"])
     scale = top["scale"].positive()
@@ -325,7 +325,7 @@ def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
         shown_names = ", ".join(names[:_MOST_NAMED])
         if len(names) > _MOST_NAMED:
             shown_names += f" and {len(names) - _MOST_NAMED} more"
-        text += f"and are skipped: {shown_names}"
+        text += f" and are skipped: {shown_names}"
         warnings.warn(f"{images}: {text}", CameraWarning, stacklevel=3)
     named = []
     for image in finite:

@@ -69,7 +69,7 @@ class Camera:
             fisheye is the distance from the eye, of others that along the axis.
 
     Raises:
-        ValueError: A shape or a value is not as above.
+        ValueError: A shape or a value is invalid.
     """
 
     viewmat: Floats
@@ -91,8 +91,8 @@ class Camera:
         if viewmat[3].tolist() != [0, 0, 0, 1]:
             refuse("viewmat", f"the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
-        # These are Python numbers: for so few values, NumPy is slower, and every frame
-        # may have a new camera.
+        # `tolist` gives Python numbers. For so few values, NumPy is slower, and every
+        # frame may have a new camera.
         (fx, skew, cx), (skew_y, fy, cy), last_row = K.tolist()
         if not (fx > 0 and fy > 0):
             refuse("K", f"positive focal lengths, got {fx:g} and {fy:g}")
@@ -154,7 +154,7 @@ class Camera:
             f"points whose distance a double can hold, got {_text(position)} and {_text(goal)}",
         )
         forward = (goal - position) / distance
-        # Scaled to at most 1, so that squares neither overflow nor underflow.
+        # The scale of at most 1 prevents overflow and underflow of squares.
         upwards = up_vector / (np.abs(up_vector).max() or 1.0)
         right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
@@ -352,7 +352,7 @@ def turntable(
     near: float | None = None,
 ) -> list[Camera]:
     """Make ``n`` cameras evenly spaced on a circle around ``center``, all looking at
-    it.
+    ``center``.
 
     Args:
         center: (3,) point in the world.
@@ -374,7 +374,7 @@ def turntable(
     if not abs(elevation) < math.pi / 2:
         refuse("elevation", f"an angle between -pi/2 and pi/2, got {elevation}")
     check("up", axis.any(), f"a direction other than zero, got {_text(axis)}")
-    axis /= np.abs(axis).max()  # squares neither overflow nor underflow
+    axis /= np.abs(axis).max()  # prevents overflow and underflow of squares
     axis /= np.linalg.norm(axis)
     # The coordinate axis with the largest angle to `up`, made perpendicular to `up`.
     start = np.eye(3)[np.argmin(np.abs(axis))]
@@ -402,7 +402,7 @@ def rigid(rotation: Floats, eye: Floats) -> Floats:
     position of the camera."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
-    # Overflow is found later, by Camera.
+    # `Camera` rejects infinite values later.
     with np.errstate(over="ignore", invalid="ignore"):
         viewmat[:3, 3] = -rotation @ eye
     return viewmat

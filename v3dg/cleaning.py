@@ -39,7 +39,7 @@ _WRONG = (1 << KINDS.index("transparent")) - 1
 
 
 class AssetWarning(UserWarning):
-    """Emitted when gaussians of an asset have invalid values and are left out, or when
+    """Emitted when gaussians of an asset have invalid values and are skipped, or when
     content of its file is ignored or converted."""
 
 

@@ -148,7 +148,7 @@ def _sprinkles(count: int, rng: np.random.Generator) -> _Surface:
 
 
 def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
-    """Return quaternions (n, 4) of rotations that turn z to the normals, after a random
+    """Return quaternions (n, 4) of rotations that map z to the normals, after a random
     rotation about z."""
     half = normals + np.array([0.0, 0.0, 1.0 + 1e-9])
     x, y, z = half.T / np.linalg.norm(half, axis=1)

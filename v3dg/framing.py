@@ -1,11 +1,11 @@
 """Chooses the first view of a subject: an object is seen from outside, a room from
 inside.
 
-A grid of voxels around most of the gaussians tells how many directions are blocked from
-each place (ambient occlusion). A subject counts as a room if much of its middle is
-empty, these empty places are blocked in nearly all directions, and there is content
-away from the outer walls. A solid object has no such empty places, and a hollow object
-has no content inside.
+In a grid of voxels around most of the gaussians, the directions that are blocked from
+each place are counted (ambient occlusion). A subject counts as a room if much of its
+middle is empty, these empty places are blocked in nearly all directions, and there is
+content away from the outer walls. A solid object has no such empty places, and a hollow
+object has no content inside.
 """
 
 import itertools
@@ -55,8 +55,8 @@ _VOXELS = 40  # number of voxels along each side of the grid
 _DIRECTIONS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
 # Limits that distinguish rooms from objects: the share of directions that must be
 # blocked from a place in a room, the clearance of such a place, and the share of the
-# middle that such places fill. They were measured on captured and made rooms, towns,
-# figures and rings.
+# middle that such places fill. They were measured on captured and generated rooms,
+# towns, figures and rings.
 _CLOSED = 0.75
 _CLEARANCE = 0.1 * _VOXELS
 _LEAST_FREE = 0.1
@@ -118,7 +118,7 @@ class Framing:
             elevation: Angle of the camera above the horizon in radians; used only for
                 an object.
             azimuth: Angle in radians by which the camera is moved around an object, or
-                turned inside a room.
+                rotated inside a room.
         """
         axis = _unit(up)
         if self._places is not None:
@@ -154,8 +154,8 @@ class Framing:
         elevation: float = DEFAULT_ELEVATION,
     ) -> list[Camera]:
         """Return cameras that go around an object in a circle, each of which shows all
-        of it, or that turn around inside a room. The distance does not depend on
-        ``count``, so the first view is the same for any number of views."""
+        of it, or cameras that look around from inside a room. The distance does not
+        depend on ``count``, so the first view is the same for any number of views."""
         axis = _unit(up)
         if self._places is not None:
             size = (width, height)

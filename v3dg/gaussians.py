@@ -143,8 +143,8 @@ class Gaussians(_Trained):
 
         Training with antialiasing draws with a filter and multiplies each opacity by
         the square root of det(covariance) before / after the filter (Mip-Splatting, eq.
-        9). `v3dg.render` draws such an asset in the same way. Files can declare it
-        (docs/formats.md), and `v3dg.write_asset` writes it.
+        9). `v3dg.render` draws such an asset in the same way. Files can declare the
+        value (docs/formats.md), and `v3dg.write_asset` writes it to them.
 
         Raises:
             TypeError: ``antialiased`` is neither a bool nor None.

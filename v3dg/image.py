@@ -128,7 +128,7 @@ class RenderedImage(Image):
         self._is_right = is_right
 
     @property
-    def _planes(self) -> _core.Drawing | _core.Picture:
+    def _planes(self) -> Planes | _core.Drawing | _core.Picture:
         if self._drawing.finish().exceeds_budget:
             self._finish()  # raises an error
         if self._is_right:

@@ -133,8 +133,8 @@ def read_asset(path: AnyPath) -> Gaussians:
       splatfacto and of the code of the 3DGS paper and 2DGS. Only tensors are read; no
       code of the pickle is run.
 
-    If the content of a file is recognised as another of these formats than its name
-    says, the content decides.
+    If the content of a file has another of these formats than its name, the content
+    determines the format.
 
     If the file declares whether the gaussians were trained with antialiasing,
     `Gaussians.antialiased` of the result has that value.
@@ -183,8 +183,8 @@ def open_asset(path: AnyPath) -> AssetFile:
 
 
 def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...]]:
-    """Return the function that opens a file. If the content is of another format than
-    the name says, it is the function for the content, with a note; if no reader
+    """Return the function that opens a file. If its content has another format than its
+    name, return the function for the content, and a note about this. If no reader
     supports the content, raise ValueError."""
     content = content_of(path)
     if content is None or _READERS.get(content.suffix) is reader:

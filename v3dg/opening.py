@@ -20,7 +20,7 @@ File: TypeAlias = str | os.PathLike[str]
 
 def open(path: str | os.PathLike[str]) -> Subject:
     """Open a file: a scene (.json), a bundle (.v3dg), or an asset in any format of
-    `read_asset`. The end of the name decides.
+    `read_asset`. The end of the name determines which one it is.
 
     `read_scene` also returns the cameras of a scene. An OpenUSD file with instances is
     opened as a scene, see `read_usd_scene`.
@@ -42,7 +42,8 @@ def opened(subject: object) -> Any:
 
 
 def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
-    """Return a scene with its cameras; or a bundle or an asset, with None."""
+    """Open a file. Return a scene and its cameras; for a bundle or an asset, return
+    None instead of cameras."""
     if is_scene(path):
         expected = (
             "a scene on this machine, got a URL; download it together with the files that it "

@@ -28,7 +28,7 @@ _ROWS = 256  # number of rows that are resampled at once
 
 # Longitude and latitude, in degrees, of the middle of each side. The projection of a
 # gaussian is exact only in the middle of a side, so many narrow sides are far more
-# precise than the six of a cube.
+# precise than the six sides of a cube.
 _MIDDLES = [(0, 90), (0, -90), *itertools.product(range(0, 360, 45), (-45, 0, 45))]
 
 

@@ -160,8 +160,8 @@ def write_picture(
             file has straight alpha: colours divided by alpha, as PNG demands.
 
     Raises:
-        TypeError, ValueError: A shape, a type or a value is not as above, or the suffix
-            is not that of a PNG or a JPEG, or with `alpha` of a PNG.
+        TypeError, ValueError: A shape, a type or a value is invalid; or the suffix is
+            not that of a PNG or a JPEG (with `alpha`, only of a PNG).
         OSError: The file cannot be written.
     """
     from PIL import Image

@@ -33,9 +33,9 @@ _T = TypeVar("_T")
 # and for each instance. The limit is about the size of the GPU's second-level cache.
 # For larger bundles, drawing the codes is as fast and needs a seventh of the memory.
 MOST_DECODED_BYTES = 48 << 20
-# Bytes per gaussian that frames on a GPU need in addition to its row.
+# Bytes per gaussian that frames on a GPU need in addition to the gaussian's row.
 _PACKED_BYTES = 64
-# More than any memory, so that pages are read as pictures need them.
+# A size that exceeds any memory, so that pages are read only as pictures need them.
 _TOO_MANY_BYTES = 1 << 62
 
 # Kinds of entries that a child after fork() must create again, because threads that
@@ -43,8 +43,8 @@ _TOO_MANY_BYTES = 1 << 62
 _NOT_INHERITED = ("frame", "pool", "scene")
 
 _NO_VALUE = object()
-# Any number of threads may enter this context at once. It is created only once, because
-# every frame needs it.
+# Any number of threads may enter this context at once. The context is created only
+# once, because every frame needs it.
 _NO_TURN = nullcontext()
 
 
@@ -74,7 +74,7 @@ class ResidentScene:
         # would keep itself alive.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
         # Drawings that may be in progress.
-        self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()
+        self._drawings: weakref.WeakSet[_core.Drawing | _core.Batch] = weakref.WeakSet()
         self._lock = threading.Lock()  # guards _drawings
         self.revision = (-1, -1, -1)
 
@@ -131,10 +131,11 @@ class ResidentScene:
                 quaternions,
                 scales,
                 scene.factors,
+                scene.environments,
             )
         self.revision = scene.revision
 
-    def add_drawing(self, drawing: _core.Drawing) -> None:
+    def add_drawing(self, drawing: _core.Drawing | _core.Batch) -> None:
         """Keep track of a frame that may be in progress."""
         if self.device.is_cuda:
             with self._lock:
@@ -356,8 +357,8 @@ class Residency:
             for key in [
                 key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED
             ]:
-                # These entries are never destroyed, because destroying them would wait
-                # for threads that do not exist in the child.
+                # Entries of the parent are never destroyed, because destroying them
+                # would wait for threads that do not exist in the child.
                 self._abandoned.append(entries.pop(key))
 
 

@@ -15,7 +15,7 @@ from v3dg.cameras import Axis, Floats
 _LEAST = 1e-140
 _MOST = 1e140
 
-# Quaternions w x y z that turn each axis to -y, which is the up direction of viewers
+# Quaternions w x y z that rotate each axis to -y, which is the up direction of viewers
 # where y points down.
 _HALF = math.sqrt(0.5)
 _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
@@ -41,15 +41,15 @@ class Similarity(NamedTuple):
 
 
 def turn_upright(up: Axis) -> Floats:
-    """Return the quaternion (4,) w x y z that turns the up axis of an asset to -y;
+    """Return the quaternion (4,) w x y z that rotates the up axis of an asset to -y;
     raise ValueError for an invalid axis."""
     one_of(up, "up", tuple(_TO_UPRIGHT))
     return np.array(_TO_UPRIGHT[up])
 
 
 def turn_between(up: Axis, target: Axis) -> Floats:
-    """Return the quaternion (4,) w x y z that turns one axis to another. Between y, -y,
-    z and -z, the x axis is unchanged."""
+    """Return the quaternion (4,) w x y z that rotates one axis to another. Between y,
+    -y, z and -z, the x axis is unchanged."""
     return product(turn_upright(target) * [1, -1, -1, -1], turn_upright(up))
 
 

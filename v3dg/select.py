@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value", bound=np.generic)
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
-# px² of screen for each gaussian of a coarser cluster. docs/levels.md lists the errors.
+# The default tolerance: px² on screen for each gaussian of a coarser cluster.
+# docs/levels.md lists the errors.
 DEFAULT_TOLERANCE = 3.0
 
 # The recommended fade for sequences of pictures. docs/fades.md describes its cost and
@@ -77,7 +78,11 @@ class Selection:
         weights = self.weights
         expected = f"{len(self)} numbers from 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
-        check("given_weights", ((weights >= 0) & (weights <= 1)).all(), f"{expected}, got others")
+        check(
+            "given_weights",
+            ((weights >= 0) & (weights <= 1)).all(),
+            f"{expected}, got other values",
+        )
         for values in (self.instance_ids, self.cluster_ids, weights):
             values.flags.writeable = False
 
@@ -212,8 +217,8 @@ class Selection:
     def _per_gaussian(
         self, column: Callable[[Clusters], npt.NDArray[_Value]], dtype: type[_Value]
     ) -> npt.NDArray[_Value]:
-        # The dtype is explicit because a scene without bundles has no column to take it
-        # from.
+        # The dtype is explicit, because a scene without bundles has no column with a
+        # dtype.
         return np.repeat(self.per_pair(column).astype(dtype), np.diff(self._first()))
 
 

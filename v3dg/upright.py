@@ -16,7 +16,7 @@ from v3dg.scene import Scene, Subject
 ASSUMED = "as in most trained assets"
 """The reason that `up_of` returns if the axis is unknown and only assumed."""
 
-# Fewer cameras than this may all be tilted.
+# With fewer cameras than this, all of them may be tilted.
 _MIN_CAMERAS = 3
 # A direction counts as parallel to an axis if the cosine of the angle between them
 # exceeds this value (26 degrees).
@@ -81,7 +81,7 @@ def up_of(
 
 
 def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:
-    """Return gaussians rotated so that -y points up, given the axis `up` that does so
+    """Return gaussians rotated so that -y points up, given the axis `up` that points up
     now. `write_asset`, and viewers of formats without axes, assume that -y is up.
     Colours are rotated, too.
 

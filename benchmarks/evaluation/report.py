@@ -29,7 +29,7 @@ class Report:
     tables: Annotated[Path, tyro.conf.arg(metavar="PATH")] = Path("evaluation.md")
     """Page to write with all tables and pictures."""
     no_plots: Flag = False
-    """Do not draw plots, which needs matplotlib; plots that exist in the folders
+    """Draw no plots, so that matplotlib is not needed. Existing plots in the folders
     remain."""
 
 

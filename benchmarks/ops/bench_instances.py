@@ -59,7 +59,7 @@ class Config:
     gaussians."""
     repeats: int = 11
     refine: int = 0
-    """Numbers of steps of refinements to measure; 0 for none."""
+    """Number of steps of a refinement to measure as well; 0 for none."""
     gsplat: bool = True
     output: str | None = None
 

@@ -27,7 +27,7 @@ from v3dg.bundle.codec import CODECS
 from v3dg.metrics import box_downsample, flip, psnr
 from v3dg.pictures import to_8bit
 
-# Of the camera, in radii of the ball with 90 % of the gaussians.
+# Distances of the camera, in radii of the ball with 90 % of the gaussians.
 DISTANCES = (1.0, 2.5, 8.0, 25.0)
 WIDTH, HEIGHT = 480, 360
 

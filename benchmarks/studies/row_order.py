@@ -1,13 +1,13 @@
-"""Whether frames are quicker where neighbouring rows of a cluster are neighbours in
-space.
+"""Are frames faster if neighbouring rows of a cluster are also neighbours in space?
 
     python -m benchmarks.studies.row_order --asset donut.ply --layout donutsea.json \\
         --device cuda -o row_order_h100.json
 
-Builds an asset whose clusters keep the order of the asset, and puts its rows in runs.
-For both orders: the mean diagonal of the box around 32 consecutive rows; frames of the
-layout in alternation, of each camera and tolerance; and on CUDA the time of each
-kernel. Builds with and without runs are timed in alternation, too.
+The study builds an asset whose clusters keep the order of the asset, and a copy whose
+rows are ordered in runs. For both orders it measures the mean diagonal of the box
+around 32 consecutive rows; the time of frames of the layout, in alternation, for each
+camera and tolerance; and on CUDA the time of each kernel. Builds with and without runs
+are also timed in alternation.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ _LEVELS = range(5)
 @dataclass
 class Config:
     asset: Path
-    """A file of gaussians."""
+    """Asset, in any format that v3dg reads."""
     layout: Path
-    """A layout of instances of that asset."""
+    """Layout of instances of that asset."""
     cameras: tuple[int, ...] = (40, 45, 46, 50, 55, 59)
-    """Indices of the layout's cameras."""
+    """Indices of cameras of the layout."""
     tolerances: tuple[float, ...] = (9.4, 3.0)
     device: Literal["cpu", "cuda"] = "cpu"
     refine: int = 0
-    """Number of pictures of a refinement of the levels before they are compared."""
+    """Number of pictures of a refinement before the comparison; 0 for none."""
     frames: int = 25
     builds: int = 0
-    """Number of builds of each kind that are timed."""
+    """Number of timed builds of each kind."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File of the results."""
+    """File for the results."""
 
 
 def as_they_come(gaussians: Gaussians, offset: Offsets) -> Gaussians:
@@ -68,13 +68,13 @@ def built(asset: Gaussians, device: str, *, is_ordered: bool) -> v3dg.Bundle:
 
 
 def ordered(bundle: v3dg.Bundle) -> v3dg.Bundle:
-    """The same clusters with their rows in runs."""
+    """Return the same clusters with their rows in runs."""
     gaussians = in_runs(bundle.gaussians, bundle.clusters.offset)
     return v3dg.Bundle(bundle.clusters, bundle.groups, gaussians, bundle.config)
 
 
 def refined(bundle: v3dg.Bundle, config: Config) -> v3dg.Bundle:
-    """Refined levels whose rows stay as they come."""
+    """Return refined levels whose rows keep their order."""
     from v3dg.levels import refined as refinement
 
     with mock.patch.object(refinement, "in_runs", as_they_come):
@@ -82,8 +82,8 @@ def refined(bundle: v3dg.Bundle, config: Config) -> v3dg.Bundle:
 
 
 def diagonals(bundle: v3dg.Bundle) -> Row:
-    """Return the mean diagonal of the boxes around full runs, for each level, and of
-    those around clusters."""
+    """Return the mean diagonal of the boxes around full runs for each level, and of the
+    boxes around clusters."""
     means = bundle.gaussians.means
     rows = {}
     for level in _LEVELS:
@@ -104,7 +104,7 @@ def _diagonal(means: np.ndarray[Any, Any]) -> float:
 
 
 class Drawing:
-    """Frames of one order."""
+    """The frames of one order of the rows."""
 
     def __init__(self, config: Config, bundle: v3dg.Bundle) -> None:
         scene, views = read_layout(config.layout, bundle)
@@ -113,7 +113,8 @@ class Drawing:
         self.cameras = [list(views.values())[number] for number in config.cameras]
 
     def frame(self, camera: Camera, tolerance: float) -> tuple[float, float, Any]:
-        """Return milliseconds by the clock and of the processors, and the picture."""
+        """Return the wall-clock time of a frame and the CPU time of all threads, in
+        milliseconds, and the picture."""
         start = time.perf_counter()
         processors_start = time.process_time()
         image = self.renderer.render(camera, tolerance=tolerance)
@@ -122,7 +123,7 @@ class Drawing:
         return 1e3 * (time.perf_counter() - start), 1e3 * processors, image
 
     def kernels(self, camera: Camera, tolerance: float) -> dict[str, float]:
-        """Return milliseconds of each kernel of a frame."""
+        """Return the milliseconds of each kernel of a frame."""
         from benchmarks.studies.frame_kernels import measure
 
         kernels: dict[str, float] = measure(("", self.renderer, camera, tolerance))["kernels"]
@@ -136,7 +137,7 @@ def host(array: Any) -> np.ndarray[Any, Any]:
 
 
 def frames(config: Config, drawings: dict[str, Drawing], index: int, tolerance: float) -> Row:
-    """Frames of one camera, in alternation."""
+    """Draw frames of one camera with both orders in alternation; return their times."""
     ms: dict[str, list[float]] = {name: [] for name in drawings}
     processor_ms: dict[str, list[float]] = {name: [] for name in drawings}
     pictures = {}

@@ -77,7 +77,8 @@ class Ahead {
         while (item >= used_ + num_places_ && !is_over_) changed_.wait(busy_);
         return !is_over_;
     }
-    // Not in the catch block, which Clang's thread-safety analysis skips.
+    // The lock is not in the catch block, because Clang's thread-safety analysis skips
+    // catch blocks.
     void fail(const std::exception_ptr& error) noexcept {
         const MutexLock lock(busy_);
         error_ = error;

@@ -11,7 +11,7 @@ namespace v3dg {
 namespace cuda {
 
 [[noreturn]] static void fail(cudaError_t error, const char* what) {
-    // clear the error, so that a later call does not report it again
+    // Clear the error, so that a later call does not report it again.
     cudaGetLastError();
     throw std::runtime_error(std::string("cuda: ") + what +
                              " failed: " + cudaGetErrorString(error));
@@ -137,7 +137,7 @@ void release(void* pointer, int device, cudaStream_t stream) noexcept {
     int current = device;
     const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
                               cudaSetDevice(device) == cudaSuccess;
-    // Ignore errors: at exit, the driver may be unloaded already, which frees the
+    // Ignore errors. At exit the driver may be unloaded already, which frees the
     // memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
@@ -198,8 +198,8 @@ void StreamMutex::release(cudaStream_t stream, bool is_captured) noexcept {
     busy_.unlock();
 }
 
-// Only call functions: Clang's thread-safety analysis skips constructors and
-// destructors.
+// The constructor and the destructor only call functions, because Clang's thread-safety
+// analysis skips constructors and destructors.
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)
     : mutex_(mutex), stream_(stream), is_captured_(is_capturing(stream)) {
     mutex.acquire(stream, is_captured_);

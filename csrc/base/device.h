@@ -42,10 +42,10 @@ unsigned num_multiprocessors();
 // Returns the bytes of shared memory of a multiprocessor.
 size_t shared_memory_of_multiprocessor();
 
-// Allows a kernel to use `bytes` of dynamic shared memory on the current device. This
-// is required if its dynamic and static shared memory together exceed 48 KiB. All
-// threads share one limit per kernel, so it is never lowered: another thread may be
-// about to launch the kernel. `name` is for error texts.
+// Allows a kernel to use `bytes` of dynamic shared memory on the current device. A
+// kernel needs this call if its dynamic and static shared memory together exceed 48
+// KiB. The limit of a kernel is shared by all threads and never lowered, because
+// another thread may be about to launch the kernel. `name` is for error texts.
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
 
 // Returns whether the kernel, as compiled for the current device, waits for the kernel
@@ -67,8 +67,8 @@ struct PoolBytes {
 PoolBytes pool_bytes();
 
 bool is_capturing(cudaStream_t stream);
-// Throws std::runtime_error if the stream is being captured. Memory that a graph
-// allocates is freed with the graph.
+// Throws std::runtime_error if the stream is being captured. Memory cannot be allocated
+// then, because memory that a graph allocates is freed with the graph.
 void refuse_capture(cudaStream_t stream);
 
 // A mutex for memory that several threads and streams use in turn.
@@ -94,7 +94,7 @@ class StreamMutex {
 
 // Holds a StreamMutex. No other thread can hold it meanwhile. Work that this thread
 // enqueues on `stream` runs after the work that was enqueued under the previous lock.
-// Captured work is not ordered; the code that replays the graph must do that.
+// Captured work is not ordered; the code that replays the graph must order it.
 class V3DG_SCOPED_CAPABILITY StreamLock {
   public:
     StreamLock(StreamMutex& mutex, cudaStream_t stream) V3DG_ACQUIRE(mutex.busy_);

@@ -24,8 +24,8 @@ class Event {
     void hold_back(cudaStream_t stream) const {
         check(cudaStreamWaitEvent(stream, event_, 0), "cudaStreamWaitEvent");
     }
-    // Returns whether the device has reached the event, without waiting. If earlier
-    // work failed, it throws an error with `work` as its name.
+    // Returns whether the device has reached the event, without waiting. Throws if
+    // earlier work failed; the error text names `work`.
     bool has_happened(const char* work) const {
         const cudaError_t state = cudaEventQuery(event_);
         if (state == cudaErrorNotReady) return false;

@@ -21,14 +21,15 @@ class FirstError {
             keep_lowest(index, std::current_exception());
         }
     }
-    // Rethrows the exception, if any. To be called after the loop.
+    // Rethrows the exception, if any. Call this after the loop.
     void rethrow() {
         const MutexLock lock(mutex_);
         if (error_) std::rethrow_exception(error_);
     }
 
   private:
-    // Not in the catch block, which Clang's thread-safety analysis skips.
+    // The lock is not in the catch block, because Clang's thread-safety analysis skips
+    // catch blocks.
     void keep_lowest(size_t index, const std::exception_ptr& error) noexcept {
         const MutexLock lock(mutex_);
         if (error_ && index >= index_) return;

@@ -41,8 +41,8 @@ static Isa choose_isa() {
     for (const Isa isa : {Isa::baseline, Isa::avx2, Isa::avx512}) {
         if (std::strcmp(wanted, isa_name(isa)) != 0) continue;
         if (isa > widest)
-            throw std::runtime_error(std::string("V3DG_ISA: this processor has no ") + wanted +
-                                     ", its widest is " + isa_name(widest));
+            throw std::runtime_error(std::string("V3DG_ISA: this processor does not support ") +
+                                     wanted + "; use at most " + isa_name(widest));
         return isa;
     }
     throw std::runtime_error(std::string("V3DG_ISA: expected baseline, avx2 or avx512, got ") +

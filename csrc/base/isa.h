@@ -17,7 +17,7 @@ const char* isa_name(Isa isa);
 }  // namespace v3dg
 
 // V3DG_DECLARE_PER_ISA repeats a declaration in the namespace of each instruction set.
-// V3DG_DISPATCH_ISA calls the function of the active one.
+// V3DG_DISPATCH_ISA calls the version for active_isa().
 #if defined(__x86_64__)
 #define V3DG_DECLARE_PER_ISA(...)           \
     namespace isa_baseline { __VA_ARGS__; } \

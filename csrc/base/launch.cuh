@@ -1,6 +1,7 @@
 #pragma once
 
-// Launches kernels. Also the helpers for blocks and warps that most kernels use.
+// Launches kernels. The file also has the helpers for blocks and warps that most
+// kernels use.
 
 #include "base/device.h"
 
@@ -63,8 +64,8 @@ __device__ inline unsigned char* shared_memory() {
 }
 
 // Returns, in lane 0, the index of the next work item of a warp. The first `dealt`
-// items are assigned statically; `taken` counts the others, from 0. To be called early,
-// because the atomic operation has a long latency.
+// items are assigned statically. `taken` is a counter, initially 0, of the items that
+// are assigned here. Call this early, because the atomic operation has a long latency.
 __device__ inline unsigned take_next(unsigned* taken, unsigned dealt) {
     return threadIdx.x % 32 == 0 ? dealt + atomicAdd(taken, 1u) : 0;
 }

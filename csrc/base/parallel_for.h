@@ -24,8 +24,8 @@ void parallel_for(size_t count, size_t chunk, const Body& body) {
         });
     };
     if (most_threads() == 1) {
-        // Without an OpenMP region, because OpenMP ends the process if it has no memory
-        // for one.
+        // Run without an OpenMP region: OpenMP ends the process if it has no memory for
+        // threads.
         for (size_t first = 0; first < count; first += chunk) run(first);
     } else {
 #pragma omp parallel for schedule(dynamic, 1) if (count > chunk) num_threads(most_threads())

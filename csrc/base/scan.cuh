@@ -59,7 +59,7 @@ __device__ inline unsigned take_ticket(unsigned* counter) {
 __device__ inline unsigned long long prefix_of_part(unsigned long long* state, size_t part,
                                                     unsigned long long sum) {
     constexpr unsigned long long kOwn = 1ull << 62, kAll = 2ull << 62, kValue = kOwn - 1;
-    // parts that a lane reads together, to hide the latency
+    // Parts that a lane reads together, to hide the latency.
     constexpr unsigned kEach = 4;
     volatile unsigned long long* word = state;
     const unsigned lane = threadIdx.x % 32;
@@ -76,15 +76,15 @@ __device__ inline unsigned long long prefix_of_part(unsigned long long* state, s
             is_ready = true;
 #pragma unroll
             for (unsigned k = 0; k < kEach; ++k) {
-                // before the first part, all sums are 0
+                // Before the first part, all sums are 0.
                 const unsigned back = kEach * lane + k;
                 seen[k] = back < end ? word[end - 1 - back] : kAll;
             }
 #pragma unroll
             for (unsigned k = 0; k < kEach; ++k) is_ready = is_ready && seen[k] >= kOwn;
         } while (!is_ready);
-        // Add up the parts of this lane, backwards to the nearest one that has
-        // published the sum of all parts up to it.
+        // Each lane adds up its parts backwards, as far as the nearest part that has
+        // published the sum of all parts up to itself.
 #pragma unroll
         for (unsigned k = 0; k < kEach; ++k) {
             of_lane += knows_all ? 0 : seen[k] & kValue;

@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// A reference to contiguous elements that it does not own.
+// A reference to contiguous elements, which it does not own.
 template <class T>
 struct Span {
     T* data = nullptr;

@@ -4,9 +4,9 @@
 
 namespace v3dg {
 
-// Returns the number of threads of a parallel region, at least 1. It is OpenMP's
-// number, limited to a plausible number of processors. It is 1 if the stack size of
-// threads is too small or too large, because OpenMP would end the process.
+// Returns the number of threads of a parallel region, at least 1: the number of OpenMP,
+// limited to a plausible number of processors. Returns 1 if the stack size of threads
+// is too small or too large, because OpenMP would end the process.
 int most_threads();
 
 }  // namespace v3dg

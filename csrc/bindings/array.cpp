@@ -64,8 +64,7 @@ Device device_of(const py::handle& array, const char* name) {
     if (backend != nullptr) {
         if (const std::optional<Device> device = backend->device_of(array)) return *device;
     } else if (!cuda_interface_of(array).is_none()) {
-        throw std::runtime_error(std::string(name) +
-                                 ": expected a NumPy array, got one on a CUDA device, and " +
+        throw std::runtime_error(std::string(name) + ": this array is on a CUDA device, but " +
                                  kWithoutCuda);
     }
     refuse_kind(name, "a NumPy array or an array on a CUDA device", array);

@@ -44,6 +44,7 @@
 #include <utility>
 #include <vector>
 
+#include "bindings/batch.h"
 #include "bindings/codes.h"
 #include "bindings/drawing.h"
 #include "bindings/tape.h"
@@ -73,17 +74,17 @@ struct Entered {
     void* stream;
 };
 
-// What a backend can do.
+// The capabilities of a backend.
 struct BackendTraits {
-    // the host can read the arrays, so the bindings check their values
+    // The host can read the arrays, so the bindings check their values.
     bool host_reads_arrays;
     bool computes_doubles;  // can draw and differentiate float64 gaussians
     size_t row_alignment;   // alignment of quaternions and SH coefficients, bytes
-    // supports only plain requests (FrameRequest::is_plain), and no picking
+    // Supports only plain requests (FrameRequest::is_plain), and no picking.
     bool draws_only_plainly;
 };
 
-// What a pool needs of a device.
+// The requirements of a device on a page pool.
 struct PoolDemands {
     // The most bytes of pages that are copied while a few frames are drawn.
     size_t most_block_bytes;
@@ -162,10 +163,18 @@ struct FrameInput {
     const Scene& scene;
     std::shared_ptr<const SceneState> state;
     Pool* pool;  // null: draw the frame's own models
-    // the state of a sequence of pictures; null for a single picture
+    // The state of a sequence of pictures; null for a single picture.
     BudgetSteps* steps;
-    // set to end the picture early, if possible; may be null
+    // A flag that asks to end the picture early, if possible. May be null.
     const std::atomic<bool>* stop;
+};
+
+// The inputs of a batch. The bindings check them like the inputs of a picture.
+struct BatchInput {
+    const BatchRequest& request;
+    const BoundCameras& cameras;
+    const Scene& scene;
+    std::shared_ptr<const SceneState> state;
 };
 
 // Draws scenes of the same bundles.
@@ -182,6 +191,10 @@ class Frame {
     // before it is finished or destroyed. A backend whose frames share buffers uses a
     // Turn. A request with a given cut has one eye.
     virtual std::unique_ptr<BoundDrawing> draw(const FrameInput& input) = 0;
+    // Draws a batch of pictures with the frame's own models. Like draw(), but the
+    // caller owns the planes, which exist until the drawing is finished. A batch that
+    // does not fit into memory is drawn in parts.
+    virtual std::unique_ptr<BoundBatch> draw_batch(const BatchInput& input) = 0;
     // Finds the gaussian with the largest blend weight in the first pixel of the
     // window. Returns false if no gaussian is drawn there. Waits. Called only if
     // draws_only_plainly is false.
@@ -205,11 +218,11 @@ class AssetFrame {
 class Target {
   public:
     virtual ~Target() = default;
-    // See levels/fit_level.h. `error` is in host memory.
+    // Fits groups of one level (levels/fit_level.h). `error` is in host memory.
     virtual void fit_level(const FitConfig& config, Span<const FitGroup> groups,
                            const GaussianRows<float>& gaussians, float* error,
                            FitProgress& progress, const Work& work) const = 0;
-    // See levels/refine_cuts.h.
+    // Refines all levels together (levels/refine_cuts.h).
     virtual void refine_cuts(const FitConfig& config, const CutComparison& comparison,
                              const CutRows& levels, const CutPictures& pictures,
                              FitProgress& progress, const Work& work) const = 0;
@@ -269,7 +282,7 @@ class Backend {
                         const Work& work) const = 0;
     virtual void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out,
                           const Work& work) const = 0;
-    // Called only if computes_doubles is true.
+    // The version for float64. Called only if computes_doubles is true.
     virtual void ellipses(const EllipsesInput<double>& in, const Ellipses<double>& out,
                           const Work& work) const = 0;
     // Waits, because the sums are in host memory.
@@ -315,8 +328,8 @@ class Backend {
 // Returns the backend of a device. Throws RuntimeError if it was not compiled.
 const Backend& backend_of(Device device);
 
-// Return the backend of the host, and that of devices. The latter is null if no
-// device's backend was compiled.
+// Return the backend of the host and the backend of devices. The backend of devices is
+// null if none was compiled.
 const Backend& host_backend();
 const Backend* device_backend();
 

@@ -162,27 +162,27 @@ void bind_cluster(py::module_& m) {
     m.attr("min_radius") = kMinRadius;
     m.attr("most_length") = kMostLength;
     m.def("examine", &findings_of, "gaussians"_a,
-          "Returns why gaussians on the host cannot be drawn: (N,) uint16 of bits, 0 for those "
-          "that can be drawn.");
+          "Returns why each gaussian cannot be drawn, as (N,) uint16 of bits; 0 if it can be "
+          "drawn. Arrays must be on the host.");
     m.def("num_halvings", &halvings, "count"_a, "cluster_size"_a,
-          "Returns how often points are halved until no part has more than cluster_size.");
+          "Returns how often `count` points must be halved until no part has more than "
+          "cluster_size.");
     m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a, "unit"_a = 1,
-          "Sorts the points of each segment into the leaves of a perfect binary tree: returns "
-          "order (N,) int64, and leaf_offset (L + 1,) int64 on the host. The left part of a node "
-          "has half of its points, rounded up to a multiple of unit.");
+          "Sorts the points of each segment into the leaves of a perfect binary tree. The left "
+          "part of a node has half of its points, rounded up to a multiple of unit. Returns order "
+          "(N,) int64, and leaf_offset (L + 1,) int64 on the host.");
     m.def("morton_order", &order_along_curve, "means"_a,
-          "Returns the order (N,) of points on the host along a Morton curve, which keeps "
-          "neighbours together.");
+          "Returns the order (N,) of points along a Morton curve, so that adjacent points are "
+          "close in space. Arrays must be on the host.");
     m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
-          "Returns a ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps "
-          "balls nested.");
-    m.def(
-        "check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a,
-        "parent_group"_a, "box"_a, "filter_px2"_a, "antialiased"_a, "ball"_a, "weight"_a,
-        "parent"_a, "group_level"_a, "error"_a, py::kw_only(), "num_gaussians"_a,
-        "Raises ValueError unless the tables of a bundle are consistent and guarantee exact cuts.");
+          "Returns a ball around each segment of spheres (N, 4): (S, 4). A margin ensures that "
+          "balls nest.");
+    m.def("check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a,
+          "parent_group"_a, "box"_a, "filter_px2"_a, "antialiased"_a, "ball"_a, "weight"_a,
+          "parent"_a, "group_level"_a, "error"_a, py::kw_only(), "num_gaussians"_a,
+          "Raises ValueError unless the tables of a bundle are consistent and lead to exact cuts.");
     m.def("bound_by_boxes", &bound_by_boxes, "gaussians"_a, "offset"_a,
-          "Returns the lower and upper corners of the boxes around what clusters draw: (C, 2, 3).");
+          "Returns boxes around what clusters draw: (C, 2, 3), lower and upper corners.");
 }
 
 }  // namespace v3dg

@@ -47,7 +47,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     const auto num_groups = static_cast<py::ssize_t>(of_level.size) - 1;
     if (num_groups < 1 || of_leaves.size != of_level.size)
         throw py::value_error(
-            "leaf_offset, group_offset: expected boundaries of the same number of groups");
+            "leaf_offset, group_offset: expected boundaries of the same groups, got " +
+            std::to_string(of_leaves.size) + " and " + std::to_string(of_level.size) + " numbers");
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
     const py::object means = backend.to_host(leaves.arrays()[0]);
     FirstSelected measured(span_of<const float>(means, "means", {num_leaves, 3}),
@@ -92,9 +93,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     return py::array_t<float>(num_groups, growth.data());
 }
 
-// Returns the balls of all levels after those of level 1 have grown by `growth`. The
-// balls of higher levels grow so that they contain the balls below. Level 0 does not
-// change.
+// Grows the balls of level 1 by `growth`, and the balls of higher levels so that they
+// contain the balls below. Returns the balls of all levels. Level 0 does not change.
 py::list grown_balls(const py::list& balls, const py::array& growth) {
     py::list grown;
     std::vector<Ball> below;
@@ -115,7 +115,7 @@ py::list grown_balls(const py::list& balls, const py::array& growth) {
             if (here.size == 0 || below.size() % here.size != 0)
                 throw py::value_error(
                     "balls: expected a count that divides the count of the level below, got " +
-                    std::to_string(here.size) + " over " + std::to_string(below.size()));
+                    std::to_string(here.size) + " and " + std::to_string(below.size()));
             std::vector<int64_t> offset;
             for (size_t g = 0; g <= here.size; ++g)
                 offset.push_back(static_cast<int64_t>(g * (below.size() / here.size)));
@@ -134,11 +134,11 @@ void bind_first_selected(py::module_& m) {
     m.def("first_selected", &first_selected, "leaves"_a, "level"_a, "leaf_offset"_a,
           "group_offset"_a, "ball"_a, "leaf_filter_px2"_a, "leaf_antialiased"_a,
           "level_filter_px2"_a,
-          "Returns the factors by which the balls of level 1 have to grow so that its groups are "
-          "selected only where they look no worse than their leaves at one sample per pixel.");
-    m.def(
-        "grown_balls", &grown_balls, "balls"_a, "growth"_a,
-        "Returns the balls of each level after those of level 1 were multiplied by these factors.");
+          "Returns the factors by which the balls of level 1 must grow. Then its groups are "
+          "selected only where they look as good as their leaves at one sample per pixel.");
+    m.def("grown_balls", &grown_balls, "balls"_a, "growth"_a,
+          "Multiplies the radii of the balls of level 1 by the factors, and enlarges the balls of "
+          "higher levels to contain them. Returns the balls of all levels.");
 }
 
 }  // namespace v3dg

@@ -1,5 +1,5 @@
-// Bindings of fits: of the groups of one level, and of all levels together to pictures
-// of cuts.
+// Bindings of the fit of the groups of one level, and of the refinement of all levels
+// together.
 
 #include <algorithm>
 #include <memory>
@@ -19,7 +19,7 @@ class BoundTarget {
   public:
     BoundTarget(const Rows& rows, float filter_px2, bool antialiased)
         : device_(rows.device()), size_(rows.size()), sh_degree_(rows.sh_degree()) {
-        static_cast<void>(rows.read<float>());  // checks that they are float32
+        static_cast<void>(rows.read<float>());  // checks that the gaussians are float32
         target_ = backend_of(device_).make_target(rows, filter_px2, antialiased);
     }
 
@@ -30,7 +30,8 @@ class BoundTarget {
     void check_alike(const Rows& gaussians) const {
         if (gaussians.device() != device_ || gaussians.sh_degree() != sh_degree_)
             throw py::value_error(
-                "gaussians: expected the device and the SH degree of the target, got others");
+                "gaussians: expected the device and the SH degree of the target, got different "
+                "ones");
     }
 
   private:
@@ -41,7 +42,7 @@ class BoundTarget {
 };
 
 // Returns the groups after checks of their ranges. Target ranges must be within
-// `num_targets` gaussians, the others within `num_rows`.
+// `num_targets` gaussians, and ranges within `num_rows`.
 std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& range,
                                 const py::array& ball, const py::array& stream, size_t num_targets,
                                 size_t num_rows) {
@@ -58,8 +59,8 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
             bounds[1] > static_cast<int64_t>(num_targets) || bounds[2] < 0 ||
             bounds[3] < bounds[2] || bounds[3] > static_cast<int64_t>(num_rows))
             throw py::value_error(
-                "target_range, range: expected [first, last) within the gaussians, got another "
-                "for group " +
+                "target_range, range: expected [first, last) within the gaussians, got numbers "
+                "outside for group " +
                 std::to_string(g));
         FitGroup group{.target_first = static_cast<uint64_t>(bounds[0]),
                        .target_count = static_cast<uint64_t>(bounds[1] - bounds[0]),
@@ -69,8 +70,8 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
                        .radius = balls[4 * g + 3],
                        .stream = static_cast<uint64_t>(streams[g])};
         if (!(group.radius > 0))
-            throw py::value_error("ball: expected a positive radius, group " + std::to_string(g) +
-                                  " has none");
+            throw py::value_error("ball: expected a positive radius, got none for group " +
+                                  std::to_string(g));
         groups.push_back(group);
     }
     return groups;
@@ -128,7 +129,7 @@ class BoundPictures {
         const auto wanted = static_cast<size_t>(offset[offset.size - 1]);
         if (gaussians.size() != wanted)
             throw py::value_error("gaussians: expected " + std::to_string(wanted) +
-                                  ", which the table has, got " + std::to_string(gaussians.size()));
+                                  " as in the table, got " + std::to_string(gaussians.size()));
     }
 
   private:
@@ -138,8 +139,10 @@ class BoundPictures {
         return cameras;
     }
     static GaussianRows<const float> on_host(const Rows& asset) {
-        if (asset.size() == 0) refuse_value("asset", "expected gaussians on the host, got none");
-        check_is_on_host(asset.device(), "asset", "expected gaussians on the host, got others");
+        if (asset.size() == 0) refuse_value("asset", "expected at least one gaussian, got none");
+        check_is_on_host(
+            asset.device(), "asset",
+            "expected gaussians on the host, got gaussians on a device; copy them to the host");
         return asset.read<float>();
     }
 
@@ -242,7 +245,7 @@ double mean_ssim_of(const py::array& picture, const py::array& target) {
     const Span<const T> t = span_of<const T>(target, "target", {height, width, channels});
     if (std::min(height, width) <= kSsimRadius || channels == 0)
         throw py::value_error("picture: expected at least " + std::to_string(kSsimRadius + 1) +
-                              " px a side, got shape " + shape_text(picture));
+                              " px on each side, got shape " + shape_text(picture));
     const auto side = [](py::ssize_t size) { return static_cast<size_t>(size); };
     const Unlocked unlocked;
     return mean_ssim<T>({p.data, t.data, side(height), side(width), side(channels)});
@@ -256,51 +259,52 @@ double ssim_of_pictures(const py::array& picture, const py::array& target) {
 }  // namespace
 
 void bind_fit_level(py::module_& m) {
-    py::class_<FitConfig>(m, "FitConfig",
-                          "How groups are fitted; a setting that is left out is an error.")
+    py::class_<FitConfig>(m, "FitConfig", "The settings of a fit. All of them are required.")
         .def(py::init(&make_config), py::kw_only(), "steps"_a, "views_per_step"_a, "num_views"_a,
              "supersample"_a, "image_size"_a, "px2_per_gaussian"_a, "distance"_a, "filter_px2"_a,
              "antialiased"_a, "loss_l1"_a, "loss_dssim"_a, "loss_alpha"_a, "step_position"_a,
              "step_log_scale"_a, "step_quat"_a, "step_logit"_a, "step_sh0"_a, "step_sh_rest"_a,
              "position_in_world"_a, "final_step"_a, "beta2"_a, "seed"_a);
     py::class_<FitProgress>(m, "FitProgress",
-                            "How far a fit is, to be looked at and cancelled from any thread.")
+                            "The progress of a fit. Any thread may read it and cancel the fit.")
         .def(py::init<>())
         .def_property_readonly("groups_done",
                                [](const FitProgress& p) { return p.groups_done.load(); })
         .def_property_readonly("loss_sum", [](const FitProgress& p) { return p.loss_sum.load(); })
         .def("cancel", [](FitProgress& p) { p.cancel = true; });
-    py::class_<BoundTarget>(m, "FitTarget", "The gaussians that groups should look like.")
+    py::class_<BoundTarget>(m, "FitTarget", "The gaussians that groups are fitted to.")
         .def(py::init<const Rows&, float, bool>(), "gaussians"_a, "filter_px2"_a, "antialiased"_a);
     m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_range"_a, "gaussians"_a,
           "range"_a, "ball"_a, "stream"_a, "progress"_a,
-          "Fits groups of gaussians, in place, to look like groups of the target inside their "
-          "balls (G, 4). "
-          "Returns the residuals (G, 2) in colour and alpha.");
+          "Fits groups of gaussians, in place, so that they look like groups of the target in "
+          "their balls (G, 4). Returns the residuals in colour and alpha: (G, 2).");
     py::class_<BoundPictures>(
         m, "CutPictures",
-        "Pictures of cuts from all around an asset, which is level 0, or from cameras.")
+        "Pictures of cuts of a bundle, from random directions or from given cameras. The asset "
+        "is level 0.")
         .def(py::init<const BoundTable&, const Rows&, const std::vector<BoundCamera>&, uint64_t>(),
              py::kw_only(), "table"_a, "asset"_a, "cameras"_a, "seed"_a, py::keep_alive<1, 2>())
         .def("view", &BoundPictures::view, "number"_a, "cut"_a = 0,
-             "The camera of the window of a view, the clusters of one of its cuts that it shows, "
-             "and the samples of a side of a pixel.");
-    py::class_<CutComparison>(m, "CutComparison", "How cuts are compared with the asset.")
+             "Returns the camera of a view's window, the clusters of one cut in this window, and"
+             " the samples per pixel side of the asset's picture.");
+    py::class_<CutComparison>(m, "CutComparison",
+                              "How a refinement compares cuts with the "
+                              "asset.")
         .def(py::init(&make_comparison), py::kw_only(), "windows_per_step"_a, "cuts_per_view"_a);
     m.def("refine_cuts", &refine_cuts_arrays, py::kw_only(), "config"_a, "comparison"_a, "target"_a,
           "gaussians"_a, "radius"_a, "pictures"_a, "progress"_a,
-          "Moves the gaussians of clusters, in place, until pictures of cuts are those of the "
-          "target.");
+          "Moves the gaussians of all levels, in place, so that pictures of cuts match pictures "
+          "of the target.");
     m.def("weigh_cuts", &weigh_cuts_arrays, "config"_a, "gaussians"_a, "pictures"_a, "progress"_a,
-          "What pictures of cuts, one a step, show of each gaussian: the sum (N,) of its blend "
-          "weights, in "
-          "parts "
-          "of the pixels of each picture, and in how many of the cuts it was (N,).");
+          "Draws one picture of a cut per step. Returns for each gaussian the sum of its blend "
+          "weights, as fractions of the pixels, and the number of cuts that contain it: (N,) and"
+          " (N,).");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
-          "Mean of 1 - SSIM of one channel, and its gradient with respect to the picture.");
+          "Returns the mean of 1 - SSIM of one channel, and its gradient with respect to the "
+          "picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,
-          "Mean of SSIM of pictures (H, W, C), both float32 or both float64; the border is "
-          "mirrored.");
+          "Returns the mean SSIM of two pictures (H, W, C), both float32 or both float64. The "
+          "border is mirrored.");
 }
 
 }  // namespace v3dg

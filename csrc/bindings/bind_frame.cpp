@@ -73,8 +73,9 @@ struct BoundRequest {
     std::optional<BoundGivenCut> cut;
     py::object cluster_colors;  // see BoundLook; null if there is none
 
-    // `camera` is a Camera or an Eyes. Testing this here is faster than overloads or
-    // implicit conversions, which would dominate the time of this constructor.
+    // `camera` is a Camera or an Eyes. A test in the constructor is faster than
+    // overloads or implicit conversions, which would take most of the constructor's
+    // time.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
                  const BoundGivenCut* given, const BoundLook* look)
         : plain{.eyes = eyes_of(camera),
@@ -101,7 +102,9 @@ struct BoundRequest {
         const py::list arrays(cluster_colors);
         for (size_t b = 0; b < scene.tables.size(); ++b) {
             if (b >= arrays.size())
-                throw py::value_error("colors: expected none, or colours of every bundle");
+                throw py::value_error("colors: expected none, or one array for each of " +
+                                      std::to_string(scene.tables.size()) + " bundles, got " +
+                                      std::to_string(arrays.size()));
             const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
             const auto colors = arrays[b].cast<py::array>();
             request.cluster_colors.push_back(
@@ -124,7 +127,9 @@ class BoundSceneFrame {
     // their clusters.
     void set_models(const py::list& models, const py::list& palettes) {
         if (!palettes.empty() && palettes.size() != models.size())
-            throw py::value_error("palettes: expected none, or one for each model");
+            throw py::value_error("palettes: expected none, or one for each of " +
+                                  std::to_string(models.size()) + " models, got " +
+                                  std::to_string(palettes.size()));
         std::vector<std::shared_ptr<const backend::Model>> model_handles;
         std::vector<std::shared_ptr<const backend::Palette>> palette_handles;
         std::vector<size_t> num_gaussians;
@@ -164,6 +169,34 @@ class BoundSceneFrame {
         return drawing;
     }
 
+    // Draws a picture for each camera with the models that were set, into planes of the
+    // caller or into new planes.
+    std::unique_ptr<BoundBatch> draw_batch(const py::object& scene_object,
+                                           const py::object& cameras_object, const SelectRule& rule,
+                                           const Shade& shade, const BoundPlanes* planes) {
+        const BoundScene& scene = checked(scene_object);
+        const auto& cameras = held<BoundCameras>(cameras_object, "cameras");
+        if (cameras.device() != device_)
+            throw py::value_error("cameras: expected arrays on the frame's device");
+        if (rule.budget != kNoBudget)
+            throw py::value_error(
+                "budget: a batch has no budget; leave it out, or draw the cameras one by one");
+        const std::shared_ptr<const SceneState> state = scene.state();
+        check_environments(cameras, state->environments->table());
+        std::optional<BoundPlanes> new_planes;
+        if (planes == nullptr) planes = &new_planes.emplace(cameras, device_, shade.with_depth);
+        planes->check(cameras, device_);
+        const BatchRequest request{.rule = rule,
+                                   .shade = shade,
+                                   .width = cameras.width(),
+                                   .height = cameras.height(),
+                                   .planes = planes->planes()};
+        std::unique_ptr<BoundBatch> batch = frame_->draw_batch(
+            {.request = request, .cameras = cameras, .scene = scene.handle(), .state = state});
+        batch->keep(py::make_tuple(py::cast(this), scene_object, cameras_object), *planes);
+        return batch;
+    }
+
     // Returns the gaussian with the largest blend weight in the first pixel of the
     // window, or None.
     std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
@@ -188,6 +221,18 @@ class BoundSceneFrame {
     }
 
   private:
+    // Throws ValueError if a camera on the host has an environment that the scene does
+    // not have.
+    static void check_environments(const BoundCameras& cameras, const EnvironmentTable& table) {
+        if (cameras.device() != kHost || cameras.environments() == nullptr) return;
+        const auto* environment = static_cast<const int32_t*>(cameras.environments());
+        for (size_t b = 0; b < cameras.size(); ++b)
+            if (environment[b] < kShared || environment[b] >= table.num_environments())
+                throw py::value_error("environments[" + std::to_string(b) + "]: expected -1 to " +
+                                      std::to_string(table.num_environments() - 1) +
+                                      ", as the scene has, got " + std::to_string(environment[b]));
+    }
+
     // Checks that the scene, the request and the pool fit each other, then calls
     // body(input).
     template <class Body>
@@ -203,11 +248,11 @@ class BoundSceneFrame {
         if (!bound.is_complete()) completed = bound.completed(device_, *state);
         const FrameRequest& request = completed ? *completed : bound.plain;
         if (has_pool && request.cut)
-            throw py::value_error("cut: a pool selects its own cut; leave out the given one");
+            throw py::value_error("cut: a pool selects its own cut; leave out `cut`");
         if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
             throw py::value_error(
-                "shows, colors, chooser, aside: these work only on the CPU; leave them out on a "
-                "CUDA device");
+                "shows, colors, chooser, aside: these are supported only on the CPU; leave "
+                "them out on a CUDA device");
         body(backend::FrameInput{.request = request,
                                  .scene = scene.handle(),
                                  .state = state,
@@ -220,7 +265,8 @@ class BoundSceneFrame {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         auto& pool = held<BoundPool>(pool_object, "pool");
         if (scene.device() != device_ || pool.device() != device_)
-            throw py::value_error("scene, pool: expected both on the frame's device");
+            throw py::value_error(
+                "scene, pool: expected both on the frame's device, got another device");
         pool.check_scene(*scene.state());
         return pool;
     }
@@ -228,19 +274,21 @@ class BoundSceneFrame {
     const BoundScene& checked(const py::object& scene_object) const {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_)
-            throw py::value_error("scene: expected a scene on the frame's device");
+            throw py::value_error(
+                "scene: expected a scene on the frame's device, got one on another device");
         const std::vector<size_t>& of_scene = scene.state()->num_gaussians;
         if (of_scene.size() > num_gaussians_.size() ||
             !std::equal(of_scene.begin(), of_scene.end(), num_gaussians_.begin()))
             throw py::value_error(
-                "scene: expected a scene of the bundles whose gaussians the frame has");
+                "scene: expected a scene of the bundles that the frame draws, got other bundles");
         return scene;
     }
 
     void check_device(Device device, const char* name) const {
         if (device != device_)
-            throw py::value_error(std::string(name) +
-                                  ": expected objects on the frame's device, got others");
+            throw py::value_error(
+                std::string(name) +
+                ": expected objects on the frame's device, got some on another device");
     }
 
     Device device_;
@@ -274,7 +322,9 @@ class BoundAssetFrame {
 }  // namespace
 
 void bind_frame(py::module_& m) {
-    py::class_<Stop>(m, "Stop", "Asks, from any thread, that a picture in progress be abandoned.")
+    py::class_<Stop>(m, "Stop",
+                     "A flag that asks work in progress to end early. Any thread may "
+                     "set it.")
         .def(py::init<>())
         .def("request", &Stop::request)
         .def_property_readonly("is_requested", &Stop::is_requested);
@@ -296,8 +346,9 @@ void bind_frame(py::module_& m) {
         .def(py::init(
                  [](const std::array<double, 3>& background, float min_transmittance,
                     bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
-             py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a);
-    py::class_<NewPicture>(m, "Picture", "The planes of a picture.")
+             py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a)
+        .def_readonly("with_depth", &Shade::with_depth);
+    py::class_<NewPicture>(m, "Picture", "A drawn picture: arrays of colour, alpha and depth.")
         .def_readonly("color", &NewPicture::color)
         .def_readonly("alpha", &NewPicture::alpha)
         .def_readonly("depth", &NewPicture::depth);
@@ -308,7 +359,7 @@ void bind_frame(py::module_& m) {
         .def_property_readonly("right", &BoundDrawing::right,
                                "The picture of the right eye, if there are two eyes.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy,
-             "Waits for the picture.");
+             "Waits until the pictures are drawn, and returns the statistics.");
     py::class_<BoundGivenCut>(m, "GivenCut", "A cut that was selected earlier; borrows the arrays.")
         .def(py::init([](const py::object& instance_ids, const py::object& cluster_ids,
                          const py::object& weights) {
@@ -317,8 +368,7 @@ void bind_frame(py::module_& m) {
              }),
              "instance_ids"_a, "cluster_ids"_a, "weights"_a = py::none());
     py::class_<BoundLook>(
-        m, "Look",
-        "What a picture shows instead of the gaussians' own colours, and the cut that it shows.")
+        m, "Look", "Optional parts of a request: false colours, and another camera for the cut.")
         .def(py::init([](const std::string& shows, const py::list& colors, const BoundEyes* chooser,
                          bool aside) {
                  BoundLook look{.look = look_of(shows), .cluster_colors = colors, .chooser = {}};
@@ -333,7 +383,7 @@ void bind_frame(py::module_& m) {
                       const BoundLook*>(),
              "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
              "look"_a = nullptr);
-    py::class_<ScenePick>(m, "Pick", "The gaussian with the largest weight in a pixel.")
+    py::class_<ScenePick>(m, "Pick", "The gaussian with the largest blend weight in a pixel.")
         .def_readonly("instance", &ScenePick::instance)
         .def_readonly("cluster", &ScenePick::cluster)
         .def_readonly("weight", &ScenePick::weight)
@@ -343,10 +393,12 @@ void bind_frame(py::module_& m) {
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "request"_a, "pool"_a = py::none(),
              "steps"_a = nullptr, "stop"_a = nullptr)
+        .def("draw_batch", &BoundSceneFrame::draw_batch, "scene"_a, "cameras"_a, "rule"_a,
+             "shade"_a, "planes"_a = nullptr)
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
-             "Returns the bytes that it holds on a CUDA device by part, and the bytes of the "
-             "memory pool that all frames there share.");
+             "Returns the bytes of the frame on a CUDA device, by part, and the bytes of the "
+             "memory pool that all frames on the device share.");
     py::class_<BoundAssetFrame>(m, "AssetFrame", "Draws gaussians without levels on their device.")
         .def(py::init<py::object, float, bool>(), "model"_a, py::kw_only(), "filter_px2"_a = 0.0f,
              "antialiased"_a = false)

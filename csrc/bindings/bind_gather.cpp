@@ -12,7 +12,9 @@ namespace {
 // Checks the requested clusters: their instances exist, and their rows are in the
 // instances' bundles.
 void check_clusters(const GatherInput& in) {
-    if (in.offset[0] != 0) throw py::value_error("offset: expected boundaries from 0");
+    if (in.offset[0] != 0)
+        throw py::value_error("offset: expected 0 as the first number, got " +
+                              std::to_string(in.offset[0]));
     for (size_t s = 0; s < in.instance.size; ++s) {
         const int32_t i = in.instance[s];
         if (i < 0 || static_cast<size_t>(i) >= in.bundle.size)
@@ -21,8 +23,10 @@ void check_clusters(const GatherInput& in) {
         const auto rows = static_cast<int64_t>(in.bundles[in.bundle[i]].size);
         const int64_t size = in.offset[s + 1] - in.offset[s];
         if (size < 0 || in.first_row[s] < 0 || in.first_row[s] > rows - size)
-            throw py::value_error("first_row, offset: expected rows of the bundle, cluster " +
-                                  std::to_string(s) + " has others");
+            throw py::value_error(
+                "first_row, offset: expected rows of the bundle, got other rows for "
+                "cluster " +
+                std::to_string(s));
     }
 }
 
@@ -44,7 +48,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     for (const Rows& bundle : bundles) {
         if (bundle.device() != Device{device})
             throw py::value_error(
-                "bundles: expected gaussians on the requested device, got others");
+                "bundles: expected gaussians on the requested device, got some on another device");
         rows.push_back(bundle.read<float>());
         sh_degree = std::max(sh_degree, bundle.sh_degree());
     }
@@ -88,10 +92,10 @@ py::tuple transform(const Rows& rows, const py::array& quaternion, const py::arr
 void bind_gather(py::module_& m) {
     m.def("gather", &gather, py::kw_only(), "bundles"_a, "instances"_a, "instance"_a, "first_row"_a,
           "offset"_a, "weights"_a = py::none(), "device"_a,
-          "Returns the gaussians of instances' clusters in the world: means, quats, scales, "
-          "opacities, sh.");
+          "Returns the gaussians of clusters of instances, in world coordinates: means, quats, "
+          "scales, opacities, sh.");
     m.def("transform", &transform, "rows"_a, "quaternion"_a, "position"_a, "scale"_a,
-          "Returns gaussians transformed by p -> scale * rotation p + position.");
+          "Returns gaussians after the transform p -> scale * rotation p + position.");
 }
 
 }  // namespace v3dg

@@ -8,6 +8,7 @@
 #include <system_error>
 #include <utility>
 
+#include "bindings/backend.h"
 #include "bindings/codes.h"
 #include "bindings/operations.h"
 #include "io/hashed_read.h"
@@ -22,7 +23,7 @@ struct BoundPageRun {
     size_t first_page;
     py::array first_cluster, offset, places;
 
-    // Borrows the arrays. `hashes` are the hashes of these pages.
+    // Borrows the arrays. `hashes` has one hash per page.
     PageRun read(const py::array& hashes) const {
         constexpr size_t kMost = size_t(1) << 62;
         PageRun run{.first_page = first_page,
@@ -33,7 +34,7 @@ struct BoundPageRun {
         run.first_cluster = boundaries_of(first_cluster, "first_cluster", run.offset.size - 1);
         if (run.first_cluster.size != run.places.size)
             throw py::value_error("places: expected " + std::to_string(run.first_cluster.size) +
-                                  ", got " + std::to_string(run.places.size));
+                                  " numbers, got " + std::to_string(run.places.size));
         run.hashes =
             span_of<const uint8_t>(hashes, "hashes", {static_cast<py::ssize_t>(run.size()), 16});
         return run;
@@ -64,9 +65,10 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
                const Rows& out) {
     const GaussianRows<float> rows = out.write();
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
-    if (out.device() != kHost || rows.size != count)
-        throw py::value_error("out: expected " + std::to_string(count) +
-                              " gaussians on the host, got others");
+    check_is_on_host(out.device(), "out", "expected arrays on the host, got arrays on a device");
+    if (rows.size != count)
+        throw py::value_error("out: expected " + std::to_string(count) + " gaussians, got " +
+                              std::to_string(rows.size));
     const bool is_quantized = codec == PageCodec::quantized;
     for (size_t page = 0; page < run.size(); ++page) {
         const Span<const int64_t> clusters = run.clusters(page);
@@ -74,8 +76,8 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
         const size_t needed = is_quantized ? page_bytes(size, clusters.size - 1, rows.sh_degree)
                                            : sizeof(float) * (11 + rows.num_sh()) * size;
         if (run.num_bytes(page) < needed)
-            throw py::value_error("places: expected " + std::to_string(needed) +
-                                  " bytes of a page, got " + std::to_string(run.num_bytes(page)));
+            throw py::value_error("places: expected at least " + std::to_string(needed) +
+                                  " bytes for a page, got " + std::to_string(run.num_bytes(page)));
     }
     naming_file(path, [&] {
         const PosixFile file = PosixFile::duplicate(descriptor);
@@ -86,7 +88,7 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
 void read_words(const py::object& path, int descriptor, const PageRun& run, const py::array& out) {
     const int64_t num_bytes = run.places[run.size()] - run.places[0];
     if (num_bytes % 4 != 0)
-        throw py::value_error("places: expected a multiple of 4 bytes, got " +
+        throw py::value_error("places: expected pages of a multiple of 4 bytes, got " +
                               std::to_string(num_bytes));
     const Span<int32_t> words =
         span_of<int32_t>(out, "out", {static_cast<py::ssize_t>(num_bytes / 4)});
@@ -202,22 +204,26 @@ void bind_pages(py::module_& m) {
     py::class_<BoundHashedRead>(m, "HashedRead",
                                 "A part of a file that is read and hashed at the same time.")
         .def("wait", &BoundHashedRead::wait,
-             "Returns the bytes once all are read; raises ValueError if the file has fewer.")
+             "Waits until all bytes are read, and returns them. Raises ValueError if the file is"
+             " shorter.")
         .def("is_sound", &BoundHashedRead::is_sound,
-             "Returns whether the bytes end with their hash.");
+             "Waits until all bytes are hashed. Returns whether the bytes end with their hash.");
     py::class_<BoundReader>(m, "HashedReader",
-                            "Reads parts of several files; small parts share memory.")
+                            "Reads and hashes parts of several files. Small parts share blocks "
+                            "of memory.")
         .def(py::init<>())
         .def("read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a,
              "num_bytes"_a, "in_pieces"_a,
-             "Reads bytes of a file that end with a BLAKE2b-128 hash: of `before` and the bytes, "
-             "or of the hashes of their pieces. The bytes are aligned to eight if the size of "
-             "`before` is a multiple of eight.");
+             "Starts to read bytes of a file that end with a BLAKE2b-128 hash. The hash is of "
+             "`before` followed by the bytes, or of the hashes of their pieces. The bytes are "
+             "aligned to 8 if the size of `before` is a multiple of 8.");
     m.def("blake2b", &hash_messages, "messages"_a,
-          "Returns the BLAKE2b-128 of several messages, which are hashed in parallel.");
+          "Returns the BLAKE2b-128 hashes of several messages, computed in parallel.");
     m.attr("DAMAGED") = kDamaged;
     m.attr("HASH_PIECE_BYTES") = kHashPieceBytes;
-    py::class_<BoundPageRun>(m, "PageRun", "Neighbouring pages of a file; borrows the arrays.")
+    py::class_<BoundPageRun>(m, "PageRun",
+                             "A range of adjacent pages of a file. It borrows the "
+                             "arrays.")
         .def(py::init([](size_t first_page, const py::array& first_cluster, const py::array& offset,
                          const py::array& places) {
                  return BoundPageRun{.first_page = first_page,
@@ -228,8 +234,8 @@ void bind_pages(py::module_& m) {
              py::kw_only(), "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a);
     m.def("read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a,
           "run"_a,
-          "Reads a run of pages with these hashes (n, 16): decodes their gaussians into rows, or "
-          "copies the pages unchanged into an array (W,) int32.");
+          "Reads and verifies a range of pages; `hashes` is (n, 16). Decodes the gaussians to "
+          "rows, or copies the pages unchanged to an array (W,) int32.");
 }
 
 }  // namespace v3dg

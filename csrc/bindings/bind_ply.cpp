@@ -19,7 +19,8 @@ std::string printable(std::string name) {
     return name;
 }
 
-// The name of a file: encoded for the system, and as messages show it.
+// The name of a file: in the encoding of the system, and in the form that messages
+// show.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;
@@ -133,12 +134,13 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
                const std::string& encoding, const std::vector<std::string>& comments) {
     for (const std::string& comment : comments)
         if (comment.find_first_of("\r\n") != std::string::npos)
-            throw py::value_error("comments: expected lines, got " + quoted(comment));
+            throw py::value_error("comments: expected text without line breaks, got " +
+                                  quoted(comment));
     const PlyEncoding chosen = encoding_of(encoding);
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
     if (k != 1 && k != 4 && k != 9 && k != 16)
-        throw py::value_error("sh: expected shape (N, K, 3) with K 1, 4, 9 or 16, got " +
+        throw py::value_error("sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got " +
                               shape_text(sh));
     const PlyGaussians<const float> in = {span_of<const float>(means, "means", {n, 3}),
                                           span_of<const float>(quats, "quats", {n, 4}),
@@ -158,11 +160,11 @@ void bind_ply(py::module_& m) {
         .def_property_readonly("num_gaussians", &BoundPlyFile::num_gaussians)
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
         .def_property_readonly("used", &BoundPlyFile::used,
-                               "Names of the properties that are read.")
+                               "The names of the properties that are read.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
-          "Returns the encoding, the bytes of the header, and the elements: name, count, and names "
-          "and types of properties.");
+          "Returns the encoding, the bytes of the header, and the elements: their names, counts,"
+          " and the names and types of their properties.");
     m.def("ply_comments", &ply_comments, "path"_a, "Returns the comments of the header, in order.");
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
           "encoding"_a, "comments"_a = std::vector<std::string>());

@@ -37,8 +37,8 @@ PageCodec codec_of(const std::string& name) {
     throw py::value_error("codec: expected float32 or quantized, got " + name);
 }
 
-// Where a pool gets the pages of a bundle from, borrowed from Python objects. Either
-// `rows` or `file` is set.
+// The source of the pages of a bundle, borrowed from Python objects. Either `rows` or
+// `file` is set.
 struct GivenSource {
     const Rows* rows = nullptr;             // pages in memory, or null
     const BoundFileSource* file = nullptr;  // pages in a file, or null
@@ -77,8 +77,9 @@ std::string told_by(PyObject* function, Span<const int64_t> places) {
 }
 
 // Wraps a Python function for threads that Python did not start. Such a thread acquires
-// the GIL for the call, so a thread that waits for it must have released the GIL. The
-// function is never released, because a pool may leave threads behind that call it.
+// the GIL for the call. A thread that waits for such a thread must therefore release
+// the GIL first. The function is never released, because a pool may leave threads
+// behind that call it.
 Fetch fetch_by(const py::object& function) {
     if (function.is_none()) return {};
     PyObject* const kept = function.inc_ref().ptr();
@@ -178,7 +179,7 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
 
 BoundPool::~BoundPool() {
     on_device_.reset();
-    // threads that are ending may be waiting for the GIL to call Python
+    // Threads that are ending may be waiting for the GIL to call Python.
     const Unlocked unlocked;
     pool_.reset();
 }
@@ -186,7 +187,8 @@ BoundPool::~BoundPool() {
 void BoundPool::check_scene(const SceneState& scene) const {
     bool fits = scene.bundles.size() == tables_.size();
     for (size_t b = 0; fits && b < tables_.size(); ++b) fits = tables_[b].is(scene.bundles[b]);
-    if (!fits) throw py::value_error("scene: expected a scene of the pool's bundles");
+    if (!fits)
+        throw py::value_error("scene: expected a scene of the pool's bundles, got other bundles");
 }
 
 SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundEyes& camera,
@@ -213,13 +215,15 @@ void bind_pool(py::module_& m) {
         .def_readonly("least_tolerance_px2", &PoolStatus::least_tolerance_px2)
         .def_readonly("error", &PoolStatus::error)
         .def_readonly("is_damage", &PoolStatus::is_damage);
-    py::class_<SettlingStep>(m, "SettlingStep", "The result of a step towards a settled view.")
+    py::class_<SettlingStep>(m, "SettlingStep",
+                             "The result of one step towards a view whose "
+                             "pages are all resident.")
         .def_readonly("tolerance_px2", &SettlingStep::tolerance_px2)
         .def_property_readonly("is_decided",
                                [](const SettlingStep& step) { return step.noted.is_decided; })
         .def_property_readonly("num_absent",
                                [](const SettlingStep& step) { return step.noted.num_absent; });
-    py::class_<BoundFileSource>(m, "FileSource", "The file that contains the pages of a bundle.")
+    py::class_<BoundFileSource>(m, "FileSource", "The file that has the pages of a bundle.")
         .def(py::init([](const std::string& name, int descriptor, const std::string& codec,
                          int sh_degree, const py::array& places, const py::array& hashes,
                          const py::object& fetch) {
@@ -234,27 +238,27 @@ void bind_pool(py::module_& m) {
              py::kw_only(), "name"_a, "descriptor"_a, "codec"_a, "sh_degree"_a, "places"_a,
              "hashes"_a, "fetch"_a = py::none());
     py::class_<BoundPool>(m, "PagePool",
-                          "Pages of bundles in memory of a fixed size on one device.")
+                          "A pool of pages of bundles, in memory of a fixed size on one device.")
         .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a,
              "device"_a, "num_bytes"_a, "num_threads"_a)
         .def("settle_step", &BoundPool::settle_step, "scene"_a, "camera"_a, "rule"_a, "begins"_a,
-             "Makes all pages resident that were read, and determines which pages a view needs.")
+             "Makes all pages resident that were read, and requests the pages that a view needs.")
         .def("status", &BoundPool::status)
         .def("resident", &resident_pages, "bundle"_a,
              "Returns which pages of a bundle are resident: (P,) bool.")
         .def("arrived", &arrived_pages, "bundle"_a,
-             "Returns for how many of eight frames each page of a bundle has been fading in: (P,) "
-             "int32.")
+             "Returns how many frames each page of a bundle has been fading in: (P,) int32, 0 to"
+             " 8.")
         .def(
             "raise_tolerance",
             [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); },
             "from_px2"_a,
-            "Raises the least tolerance unless the needs of the last view fit; returns whether it "
-            "did.")
+            "Raises the smallest tolerance unless the pages of the last view fit. Returns "
+            "whether it did.")
         .def(
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); },
             "seconds"_a, py::call_guard<Unlocked>(),
-            "Waits for pages; returns whether there are any to make resident.")
+            "Waits for pages that were read. Returns whether any can become resident.")
         .def(
             "read_one", [](BoundPool& p) { return p.pool().read_one(); },
             py::call_guard<Unlocked>());

@@ -69,21 +69,21 @@ py::tuple palette_of(const py::array& vectors, size_t size) {
 
 void bind_quantize(py::module_& m) {
     m.def("page_code_bytes", &page_code_bytes, "sh_degree"_a,
-          "Returns the bytes of a gaussian and of a cluster in a page of codes, and the alignment "
-          "of pages.");
+          "Returns the bytes per gaussian and per cluster in a coded page, and the alignment of "
+          "pages.");
     m.def("encode_page", &encode_rows, "gaussians"_a, "offset"_a,
-          "Returns a page as (W,) int32: the gaussians from offset[0] on as codes relative to the "
-          "ranges of their clusters, which begin at `offset` (K+1,).");
+          "Encodes gaussians offset[0] to offset[K] as a page. Cluster k begins at offset[k]. "
+          "Returns the page as (W,) int32.");
     m.def("decode_page", &decode_rows, "page"_a, "offset"_a, "out"_a,
-          "Writes the gaussians of a page of codes to rows from offset[0] on.");
+          "Decodes the gaussians of a coded page to the rows from offset[0] on.");
     m.def("codebook_of", &codebook_of, "values"_a,
-          "Returns 256 ascending numbers near the values (N,), by Lloyd's algorithm; exact if "
-          "there are at most 256 different values.");
+          "Returns 256 ascending numbers that represent the values (N,), by Lloyd's algorithm. "
+          "They are exact if there are at most 256 different values.");
     m.def("palette_of", &palette_of, "vectors"_a, "size"_a,
-          "Returns at most `size` vectors (K, D) that represent many (N, D), and the label of each "
-          "(N,).");
+          "Returns a palette of at most `size` vectors (K, D) that represent the vectors (N, D),"
+          " and the label of each vector (N,).");
     py::class_<BoundCodes>(m, "Codes",
-                           "All pages of a bundle as codes, on the host; borrows the arrays.")
+                           "All coded pages of a bundle, on the host. It borrows the arrays.")
         .def(py::init<py::array, py::array, py::array, int>(), "pages"_a, "first_cluster"_a,
              "offset"_a, "sh_degree"_a);
 }

@@ -71,8 +71,11 @@ Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const Dra
 void bind_rasterize(py::module_& m) {
     py::class_<Tape>(
         m, "Tape",
-        "The data that rasterize leaves for rasterize_backward; it keeps the gaussians alive.");
-    py::class_<RenderCounts>(m, "RenderCounts", "The statistics of a picture that the host drew.")
+        "The results of rasterize() that rasterize_backward() needs. It keeps the gaussians "
+        "alive.");
+    py::class_<RenderCounts>(m, "RenderCounts",
+                             "The statistics of a picture that was drawn on "
+                             "the host.")
         .def_readonly("in_frustum", &RenderCounts::in_frustum)
         .def_readonly("records", &RenderCounts::records)
         .def_readonly("entries", &RenderCounts::entries)
@@ -83,9 +86,15 @@ void bind_rasterize(py::module_& m) {
         .def_readonly("color", &BoundRasterized::color, "(H, W, 3).")
         .def_readonly("alpha", &BoundRasterized::alpha, "(H, W).")
         .def_readonly("depth", &BoundRasterized::depth, "(H, W), or None.")
-        .def_readonly("counts", &BoundRasterized::counts, "None if a device drew the picture.")
-        .def_readonly("tape", &BoundRasterized::tape, "None unless it was requested.");
-    py::class_<Gradients>(m, "Gradients", "Gradients of a picture by the gaussians that it shows.")
+        .def_readonly("counts", &BoundRasterized::counts,
+                      "The statistics; None if the picture was "
+                      "drawn on a device.")
+        .def_readonly("tape", &BoundRasterized::tape,
+                      "The tape for the backward pass; None if "
+                      "not requested.");
+    py::class_<Gradients>(m, "Gradients",
+                          "The gradients of a picture with respect to its "
+                          "gaussians.")
         .def_readonly("means", &Gradients::means)
         .def_readonly("quats", &Gradients::quats)
         .def_readonly("scales", &Gradients::scales)
@@ -98,7 +107,9 @@ void bind_rasterize(py::module_& m) {
             "center_sizes", &Gradients::center_sizes,
             "(N, 2), sums over pixels of absolute gradients with respect to the centres, or None.");
     py::class_<BoundEllipses>(
-        m, "Ellipses", "Gaussians projected onto an image; zeros for those that are not visible.")
+        m, "Ellipses",
+        "The ellipses of projected gaussians. All values of an invisible gaussian"
+        " are zero.")
         .def_readonly("centers", &BoundEllipses::centers, "(N, 2), px.")
         .def_readonly("depths", &BoundEllipses::depths, "(N,).")
         .def_readonly("conics", &BoundEllipses::conics, "(N, 3).")
@@ -131,9 +142,13 @@ void bind_rasterize(py::module_& m) {
                                  {.sum = with_centers, .size = with_sizes});
         },
         "tape"_a, "d_color"_a, "d_alpha"_a, "d_depth"_a, "with_centers"_a = false,
-        "with_sizes"_a = false, "Computes the gradients of gaussians from those of a picture.");
+        "with_sizes"_a = false,
+        "Computes the gradients of gaussians from the gradients of a "
+        "picture.");
     m.def("ellipses", &ellipses, "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a,
-          "antialiased"_a, "far_depth"_a, "min_radius_px"_a, "Projects gaussians onto an image.");
+          "antialiased"_a, "far_depth"_a, "min_radius_px"_a,
+          "Projects gaussians to ellipses on the "
+          "image.");
 }
 
 }  // namespace v3dg

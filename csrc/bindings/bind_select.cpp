@@ -142,30 +142,31 @@ BoundCut::BoundCut(const SelectOutput& out)
 
 void bind_select(py::module_& m) {
     py::class_<BoundTable>(m, "ClusterTable",
-                           "The tables of a bundle's clusters that selection and drawing read.")
+                           "The tables of a bundle that selection and drawing read.")
         .def(py::init<py::array, py::array, py::array, py::array, py::array, py::array, py::array,
                       py::array, py::array, py::object, py::object>(),
              py::kw_only(), "ball"_a, "weight"_a, "level"_a, "own_group"_a, "parent_group"_a,
              "box"_a, "filter_px2"_a, "antialiased"_a, "offset"_a, "page_shift"_a = py::none(),
              "page_begins"_a = py::none())
         .def("bytes_on", &BoundTable::bytes_on, "device"_a,
-             "Returns the bytes of the tables on a device.");
+             "Returns the memory in bytes of the tables on a device.");
     py::class_<BoundCut>(m, "Cut",
-                         "The clusters selected for one view, and the results of the selection.")
+                         "A selected cut: pairs (instance, cluster), and the results of the "
+                         "budget.")
         .def_readonly("instance_ids", &BoundCut::instance_ids)
         .def_readonly("cluster_ids", &BoundCut::cluster_ids)
         .def_readonly("weights", &BoundCut::weights,
-                      "Empty without a fade; then all weights are 1.")
+                      "The weight of each pair. Empty without a fade: all weights are 1.")
         .def_readonly("num_gaussians", &BoundCut::num_gaussians)
         .def_readonly("tolerance_px2", &BoundCut::tolerance_px2)
         .def_readonly("fits_budget", &BoundCut::fits_budget);
     m.def("group_metrics", &group_metrics, "tables"_a, "instances"_a, "camera"_a, "rule"_a,
-          "Returns the metric of every group of every instance, px2, and the first index of each "
-          "instance's metrics.");
+          "Returns the metric, px², of every group of every instance, and the first index of "
+          "each instance's metrics.");
     m.def("bounds_may_draw", &bounds_may_draw, "tables"_a, "instances"_a, "camera"_a, "rule"_a,
           "and_coarser"_a,
-          "Returns, for each eight neighbouring clusters of every instance, 0 if their bounds show "
-          "that none is drawn; and the first index of each instance's values.");
+          "Returns one value per instance and run of eight clusters: 0 if bounds show that none "
+          "of them is drawn, else 1. Also returns the first index of each instance's values.");
 }
 
 }  // namespace v3dg

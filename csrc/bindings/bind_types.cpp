@@ -5,6 +5,7 @@
 
 #include "bindings/backend.h"
 #include "bindings/operations.h"
+#include "camera/camera_arrays.h"
 #include "math/sh.h"
 
 namespace v3dg {
@@ -50,27 +51,13 @@ Intrinsics<double> with_lens(const Pinhole<double>& projection, const std::strin
 BoundCamera make_camera(const py::array& viewmat, const py::array& K, int width, int height,
                         double near, const std::string& model,
                         const std::vector<double>& distortion) {
-    if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
-        throw py::value_error("width, height: expected 1 to 65535 px, got " +
-                              std::to_string(width) + " x " + std::to_string(height));
+    check_image_size(width, height);
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
     const Span<const double> k = span_of<const double>(K, "K", {3, 3});
     BoundCamera out;
     std::copy(view.begin(), view.end(), out.viewmat.begin());
-    Camera& camera = out.camera;
-    camera = with_projection(with_lens({.fx = k[0],
-                                        .fy = k[4],
-                                        .cx = k[2],
-                                        .cy = k[5],
-                                        .width = double(width),
-                                        .height = double(height),
-                                        .near_depth = near},
-                                       model, distortion));
-    for (int row = 0; row < 3; ++row) {
-        for (int a = 0; a < 3; ++a) camera.rotation[3 * row + a] = view[4 * row + a];
-        camera.translation[row] = view[4 * row + 3];
-    }
-    eye_of(view.data, camera.eye);
+    out.camera = camera_of(view.data, k.data, width, height, near);
+    out.camera.set_lens(with_lens(out.camera.pinhole(), model, distortion));
     return out;
 }
 
@@ -101,7 +88,8 @@ double lens_range_of(const BoundCamera& bound) {
 
 BoundEyes make_eyes(const BoundCamera& left, const BoundCamera& right) {
     if (!std::equal(left.camera.rotation, left.camera.rotation + 9, right.camera.rotation))
-        throw py::value_error("left, right: expected cameras with the same rotation");
+        throw py::value_error(
+            "left, right: expected cameras with the same rotation, got different rotations");
     if (!left.camera.is_pinhole() || !right.camera.is_pinhole())
         throw py::value_error("left, right: expected pinholes, got a distorted camera");
     return {Eyes(left.camera, right.camera)};
@@ -123,7 +111,8 @@ SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32
     rule.culls = culls;
     if (!(fade >= 1) || (fade > 1 && rule.footprint == Footprint::paper))
         throw py::value_error(
-            "fade: expected a factor of 1 or more, and 1 with the paper's footprint");
+            "fade: expected 1 or more, and exactly 1 with footprint 'paper', got " +
+            std::to_string(fade));
     rule.fade = {static_cast<float>(fade), 1.0f / static_cast<float>(fade)};
     rule.frame = frame;
     return rule;
@@ -140,11 +129,17 @@ void check_footprint(const Eyes& eyes, const SelectRule& rule) {
             "footprint: expected 'solid_angle' for a distorted camera, got 'paper'");
 }
 
+void check_image_size(int width, int height) {
+    if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
+        throw py::value_error("width, height: expected 1 to 65535 px, got " +
+                              std::to_string(width) + " x " + std::to_string(height));
+}
+
 int degree_of_bases(py::ssize_t bases, const std::string& shape) {
     int degree = 0;
     while (degree <= 3 && num_sh_bases(degree) != bases) ++degree;
     if (degree > 3)
-        throw py::value_error("sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got " + shape);
+        throw py::value_error("sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got " + shape);
     return degree;
 }
 
@@ -169,8 +164,8 @@ Rows::Rows(py::object means, py::object quats, py::object scales, py::object opa
     remember(rows);
     for (const float* start : {rows.quats, rows.sh})
         if (reinterpret_cast<uintptr_t>(start) % traits.row_alignment != 0)
-            throw py::value_error("quats, sh: expected memory aligned to " +
-                                  std::to_string(traits.row_alignment) + " bytes");
+            throw py::value_error("quats, sh: expected memory that is aligned to " +
+                                  std::to_string(traits.row_alignment) + " bytes; copy the arrays");
 }
 
 void Rows::check_precision(bool wants_double) const {
@@ -202,7 +197,8 @@ Instances::Instances(py::array bundle, py::array positions, py::array quaternion
 }
 
 Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count) {
-    static_assert(sizeof(InstanceFactors) == 4 * sizeof(float), "a row of four numbers");
+    static_assert(sizeof(InstanceFactors) == 4 * sizeof(float),
+                  "InstanceFactors must have the layout of a row of four floats");
     if (factors.is_none()) return {};
     const Span<const float> rows = span_of<const float>(factors, "factors", {count, 4});
     return {reinterpret_cast<const InstanceFactors*>(rows.data), static_cast<size_t>(count)};
@@ -226,7 +222,7 @@ Span<const int64_t> offsets_of(const py::handle& offset, size_t last) {
     for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
     if (!good)
         throw py::value_error("offset: expected ascending boundaries from 0 to " +
-                              std::to_string(last) + ", got others");
+                              std::to_string(last) + ", got other numbers");
     return values;
 }
 
@@ -252,17 +248,16 @@ py::object sh_bases_of(int degree, const py::array& directions) {
 
 void bind_types(py::module_& m) {
     m.def("sh_bases", &sh_bases_of, "degree"_a, "directions"_a,
-          "The bases of spherical harmonics in unit directions: (D, (degree + 1)^2).");
-    py::class_<BoundCamera>(m, "Camera",
-                            "A camera, or a window of its image; the input of every operation.")
+          "Returns the bases of spherical harmonics in unit directions: (D, (degree + 1)^2).");
+    py::class_<BoundCamera>(m, "Camera", "A camera of any model, or a window of its image.")
         .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a,
              "near"_a, "model"_a = "pinhole", "distortion"_a = std::vector<double>{},
              "The model is pinhole; opencv, with the coefficients k1 to k6, p1 and p2; or fisheye, "
              "with k1 to k4.")
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
-             "Returns the same camera restricted to the pixels [x0, x1) x [y0, y1) of its image.")
-        .def_property_readonly("position", &position_of, "Position in the world: (3,).")
-        .def_property_readonly("K", &matrix_of, "Camera matrix in px: (3, 3).")
+             "Returns the camera for a part of its image: x in [x0, x1) and y in [y0, y1), px.")
+        .def_property_readonly("position", &position_of, "The position in the world: (3,).")
+        .def_property_readonly("K", &matrix_of, "The camera matrix, px: (3, 3).")
         .def_property_readonly("lens_range", &lens_range_of,
                                "The end of the valid range of a lens: the largest slope x / z of "
                                "opencv, the largest angle of fisheye in radians.")
@@ -272,8 +267,9 @@ void bind_types(py::module_& m) {
             "The density of pixels that selection assumes.")
         .def_property_readonly("width", &BoundCamera::width)
         .def_property_readonly("height", &BoundCamera::height);
-    py::class_<BoundEyes>(
-        m, "Eyes", "Two cameras with the same rotation that share a cut; or a single camera.")
+    py::class_<BoundEyes>(m, "Eyes",
+                          "A camera, or the two eyes of a stereo camera, which share a cut. Their "
+                          "rotations are equal.")
         .def(py::init([](const BoundCamera& only) { return BoundEyes{only.camera}; }), "camera"_a)
         .def(py::init(&make_eyes), "left"_a, "right"_a);
     py::implicitly_convertible<BoundCamera, BoundEyes>();
@@ -283,7 +279,7 @@ void bind_types(py::module_& m) {
              "footprint"_a, "culls"_a, "fade"_a = 1.0, "frame"_a = 0)
         .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
     py::class_<Instances>(m, "Instances",
-                          "Instances of bundles; borrows the arrays, which are on the host.")
+                          "The instances of a scene, on the host. It borrows the arrays.")
         .def(py::init<py::array, py::array, py::array, py::array, py::array, py::object>(),
              py::kw_only(), "bundle"_a, "positions"_a, "quaternions"_a, "scales"_a, "importance"_a,
              "factors"_a = py::none());
@@ -293,7 +289,7 @@ void bind_types(py::module_& m) {
         .def("__len__", &Rows::size)
         .def_property_readonly(
             "device", [](const Rows& rows) { return rows.device().number; },
-            "Index of the CUDA device; -1 on the host.")
+            "The index of the CUDA device; -1 on the host.")
         .def_property_readonly("sh_degree", &Rows::sh_degree);
 }
 

@@ -20,7 +20,7 @@ inline Span<const int64_t> boundaries_of(const py::array& array, const char* nam
     for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
     if (!good)
         throw py::value_error(std::string(name) + ": expected ascending boundaries from 0 to " +
-                              std::to_string(count) + ", got others");
+                              std::to_string(count) + ", got other numbers");
     return values;
 }
 

@@ -64,7 +64,7 @@ struct Torch {
           int32_(py::module_::import("torch").attr("int32")),
           uint8_(py::module_::import("torch").attr("uint8")) {}
 
-    // Returns the module torch after initialising CUDA. For callers that do not
+    // Returns the module torch after initialising CUDA. It is for callers that do not
     // initialise CUDA otherwise.
     static py::module_ initialised_cuda() {
         py::module_::import("torch.cuda").attr("init")();
@@ -223,7 +223,7 @@ class CudaBackend final : public Backend {
     }
     void ellipses(const EllipsesInput<double>&, const Ellipses<double>&,
                   const Work&) const override {
-        throw std::invalid_argument("gaussians: float64 is computed on the CPU only");
+        throw std::invalid_argument("gaussians: float64 is supported only on the CPU; use float32");
     }
     void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& gaussians,
                     const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress,
@@ -284,7 +284,7 @@ class CudaBackend final : public Backend {
 }  // namespace
 }  // namespace cuda
 
-// Never destroyed, because Python may end before the process.
+// The backend is never destroyed, because Python may end before the process.
 const Backend& cuda_backend() {
     static const Backend& backend = *new cuda::CudaBackend;
     return backend;

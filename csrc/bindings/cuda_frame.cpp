@@ -58,7 +58,8 @@ class BackendScene final : public backend::Scene {
     void set_instances(SceneState& state, const Work& work) override {
         const Poses poses(state);
         tables_.set_instances(state.instances.bundle, state.instances.importance,
-                              state.instances.factors, stream_of(work));
+                              state.instances.factors, state.environments->table(),
+                              stream_of(work));
         poses.give_to(tables_, work);
     }
     void set_poses(SceneState& state, const Work& work) override {
@@ -161,11 +162,67 @@ class EnqueuedDrawing final : public BoundDrawing {
   private:
     const Device device_;
     const std::shared_ptr<Mutex> turns_;  // shared with the frame
-    // destroyed before the objects that it uses
+    // The drawing is destroyed before the objects that it uses.
     const std::unique_ptr<Drawing> drawing_;
     DevicePages* const pages_;  // the pool that provides the gaussians; may be null
     const SelectRule rule_;
 };
+
+// A batch that was enqueued.
+class EnqueuedBatch final : public BoundBatch {
+  public:
+    EnqueuedBatch(Device device, std::shared_ptr<Mutex> turns,
+                  std::unique_ptr<BatchDrawing> drawing)
+        : device_(device), turns_(std::move(turns)), drawing_(std::move(drawing)) {}
+
+    void finish() override {
+        if (is_finished_) return;
+        const Work work(device_);
+        {
+            const Unlocked unlocked;
+            drawing_->wait();
+        }
+        const Turn turn(*turns_);
+        drawing_->finish();  // may draw parts again
+        is_finished_ = !drawing_->is_captured();
+    }
+
+    BatchStats stats() override {
+        finish();
+        const Work work(device_);
+        const Turn turn(*turns_);
+        BatchStats stats;
+        for (const ImageCounts& counts : drawing_->counts()) {
+            stats.gaussians.push_back(static_cast<int64_t>(counts.gaussians));
+            stats.in_frustum.push_back(static_cast<int64_t>(counts.in_frustum));
+        }
+        const FrameTimes times = drawing_->times();
+        stats.select_ms.push_back(times.prepare_ms);
+        stats.draw_ms.push_back(times.draw_ms);
+        stats.num_parts = static_cast<int>(drawing_->num_parts());
+        return stats;
+    }
+
+  private:
+    const Device device_;
+    const std::shared_ptr<Mutex> turns_;  // shared with the frame
+    // Destroyed before the objects that it uses.
+    const std::unique_ptr<BatchDrawing> drawing_;
+    bool is_finished_ = false;
+};
+
+CameraArrays arrays_of(const BoundCameras& cameras) {
+    return {.viewmats = cameras.viewmats().data,
+            .intrinsics = cameras.intrinsics().data,
+            .environments = cameras.environments(),
+            .are_viewmats_double = cameras.viewmats().are_double,
+            .are_intrinsics_double = cameras.intrinsics().are_double,
+            .shares_intrinsics = cameras.shares_intrinsics(),
+            .are_environments_long = cameras.are_environments_long(),
+            .width = cameras.width(),
+            .height = cameras.height(),
+            .near_depth = cameras.near_depth()};
+}
 
 FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& planes = {}) {
     const std::array<double, 3>& color = shade.background;
@@ -176,7 +233,7 @@ FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& 
 
 PicturePlanes planes_of(NewPicture& picture, Device device) {
     const NewPlanes<float> planes = picture.allocate<float>(device);
-    return {planes.color, planes.alpha, planes.depth};
+    return {planes.color, planes.alpha, planes.depth, false};
 }
 
 // Returns the pictures of the eyes, without memory yet.
@@ -193,8 +250,8 @@ EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures
                         : EyeImages{{image[0], {}}, 1, stop};
 }
 
-// Returns a function that allocates the pictures through torch. It is called after the
-// first kernels are enqueued, because it is slow.
+// Returns a function that allocates the pictures through torch. The frame calls it
+// after the first kernels are enqueued, because allocating is slow.
 cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
     return [&pictures, device](PicturePlanes planes[2]) {
         for (size_t k = 0; k < pictures.size(); ++k) planes[k] = planes_of(pictures[k], device);
@@ -226,6 +283,15 @@ class BackendFrame final : public backend::Frame {
                         [&](const SelectRule& paced, uint32_t*) { return enqueue(input, paced); });
     }
 
+    std::unique_ptr<BoundBatch> draw_batch(const backend::BatchInput& input) override {
+        const Turn turn(*turns_);
+        const Work work(device_);
+        return std::make_unique<EnqueuedBatch>(
+            device_, turns_,
+            frame_.draw_batch(tables_of(input.scene), input.request, arrays_of(input.cameras),
+                              static_cast<uint32_t>(input.cameras.size()), stream_of(work)));
+    }
+
     bool pick(const backend::FrameInput&, ScenePick&) override {
         throw py::value_error("pick: expected a frame on the CPU, got one on a CUDA device");
     }
@@ -252,8 +318,8 @@ class BackendFrame final : public backend::Frame {
         std::unique_ptr<Drawing> drawing =
             frame_.draw(tables_of(input.scene), pages, request, used, images, stream_of(work),
                         place_of(pictures, device_));
-        // The tolerance to report: without a pool, that of the request; with a pool,
-        // the one that the pool may have raised.
+        // Report the tolerance of the request. With a pool, report the tolerance that
+        // the pool may have raised.
         const SelectRule& reported = pages == nullptr ? request.rule : used;
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), reported, pages);
@@ -267,7 +333,7 @@ class BackendFrame final : public backend::Frame {
     const Device device_;
     // Shared with drawings, which may be finished after the frame is destroyed.
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
-    // Own the memory that the frame reads.
+    // The members below own the memory that the frame reads.
     std::vector<std::shared_ptr<const backend::Model>> models_ V3DG_GUARDED_BY(*turns_);
     SceneFrame frame_ V3DG_GUARDED_BY(*turns_);
 };

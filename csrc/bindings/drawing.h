@@ -15,8 +15,8 @@ namespace v3dg {
 
 // A Turn gives one thread exclusive use of a frame until the Turn is destroyed. The GIL
 // does not suffice, because torch releases it during allocations. The constructor
-// releases the GIL while it waits, because the other thread may need it to finish. For
-// backends whose frames share buffers.
+// releases the GIL while it waits, because the thread that uses the frame may need the
+// GIL. Only backends whose frames share buffers need a Turn.
 class V3DG_SCOPED_CAPABILITY Turn {
   public:
     explicit Turn(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { wait_for(mutex); }
@@ -25,8 +25,8 @@ class V3DG_SCOPED_CAPABILITY Turn {
     Turn& operator=(const Turn&) = delete;
 
   private:
-    // Not in the constructor, because Clang's thread-safety analysis skips
-    // constructors.
+    // This function is not part of the constructor, because Clang's thread-safety
+    // analysis skips constructors.
     static void wait_for(Mutex& mutex) V3DG_ACQUIRE(mutex) {
         if (mutex.try_lock()) return;
         const Unlocked unlocked;
@@ -38,16 +38,16 @@ class V3DG_SCOPED_CAPABILITY Turn {
 
 // The statistics of a frame. Times are in milliseconds.
 struct FrameStats {
-    // selected gaussians; if exceeds_budget, those of the coarsest cut
+    // Selected gaussians. If exceeds_budget, the gaussians of the coarsest cut.
     int64_t gaussians;
     uint64_t in_frustum, records, entries, items;
     float tolerance_px2;
     bool exceeds_budget;
     double select_ms, draw_ms;
-    // selected gaussians of each level; set on the host only
+    // Selected gaussians of each level; set on the host only.
     std::vector<int64_t> levels;
-    // How often the frame was drawn. More than once if a buffer on the device was too
-    // small.
+    // The number of times that the frame was drawn: above 1 if a buffer on the device
+    // was too small.
     int num_draws = 1;
 };
 

@@ -191,7 +191,7 @@ class HostBackend final : public Backend {
 }  // namespace
 }  // namespace host
 
-// Never destroyed, because Python may end before the process.
+// The backend is never destroyed, because Python may end before the process.
 const Backend& host_backend() {
     static const Backend& backend = *new host::HostBackend;
     return backend;

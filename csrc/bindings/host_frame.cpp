@@ -7,6 +7,7 @@
 #include <cstring>
 
 #include "base/mutex.h"
+#include "camera/camera_arrays.h"
 #include "residency/host_pages.h"
 
 namespace v3dg::host {
@@ -126,6 +127,41 @@ FrameStats stats_of(const SceneFrameCounts& counts) {
             .levels = counts.levels};
 }
 
+BatchStats stats_of(const std::vector<SceneFrameCounts>& counts) {
+    BatchStats stats;
+    for (const SceneFrameCounts& one : counts) {
+        stats.gaussians.push_back(one.gaussians);
+        stats.in_frustum.push_back(static_cast<int64_t>(one.render.in_frustum));
+        stats.select_ms.push_back(1e3 * one.select_seconds);
+        stats.draw_ms.push_back(1e3 * one.draw_seconds);
+        stats.levels.push_back(one.levels);
+    }
+    return stats;
+}
+
+// A batch on the host, which is drawn when draw_batch() returns.
+class DrawnBatch final : public BoundBatch {
+  public:
+    explicit DrawnBatch(BatchStats stats) : stats_(std::move(stats)) {}
+    BatchStats stats() override { return stats_; }
+
+  private:
+    const BatchStats stats_;
+};
+
+// Returns the cameras of arrays on the host. The arrays are float64.
+std::vector<Camera> cameras_of(const BoundCameras& arrays) {
+    const auto* viewmats = static_cast<const double*>(arrays.viewmats().data);
+    const auto* intrinsics = static_cast<const double*>(arrays.intrinsics().data);
+    const size_t stride = arrays.shares_intrinsics() ? 0 : 9;
+    std::vector<Camera> cameras;
+    cameras.reserve(arrays.size());
+    for (size_t b = 0; b < arrays.size(); ++b)
+        cameras.push_back(camera_of(viewmats + 16 * b, intrinsics + stride * b, arrays.width(),
+                                    arrays.height(), arrays.near_depth()));
+    return cameras;
+}
+
 template <class T>
 Picture<T> picture_in(NewPicture& made, const Window& window, const Shade& shade) {
     const NewPlanes<T> planes = made.allocate<T>(kHost);
@@ -192,6 +228,30 @@ class HostFrame final : public backend::Frame {
                         [&](const SelectRule& paced, uint32_t* last_bin) {
                             return draw_paced(input, paced, last_bin);
                         });
+    }
+
+    std::unique_ptr<BoundBatch> draw_batch(const backend::BatchInput& input) override {
+        const BoundCameras& cameras = input.cameras;
+        const SceneState& state = *input.state;
+        const std::shared_ptr<const HostModels> kept = models_;
+        const std::vector<SceneModel> models = kept->of_scene(state);
+        std::vector<SceneFrameCounts> counts(cameras.size());
+        {
+            const Unlocked unlocked;
+            const std::vector<Camera> camera = cameras_of(cameras);
+            std::vector<int32_t> environment(cameras.size(), kSeesAll);
+            const auto* given = static_cast<const int32_t*>(cameras.environments());
+            if (given != nullptr) environment.assign(given, given + cameras.size());
+            cpu::draw_batch(HostScene{.tables = {state.tables.data(), state.tables.size()},
+                                      .models = {models.data(), models.size()},
+                                      .instances = state.instances},
+                            input.request,
+                            {.camera = {camera.data(), camera.size()},
+                             .environment = {environment.data(), environment.size()},
+                             .environments = state.environments->table()},
+                            {counts.data(), counts.size()});
+        }
+        return std::make_unique<DrawnBatch>(stats_of(counts));
     }
 
     bool pick(const backend::FrameInput& input, ScenePick& picked) override {

@@ -18,7 +18,8 @@
 // Ends the idle threads of GNU's OpenMP (libgomp) before a fork(). The child would have
 // no such threads, but would wait for them for ever. The next parallel loop starts new
 // threads, in the parent as in the child. LLVM's OpenMP, which may replace libgomp,
-// handles fork() itself; this call would wait for locks that it holds.
+// handles fork() itself. With LLVM's OpenMP, this call would wait for ever for locks
+// that LLVM's own fork handler holds.
 static void let_threads_go() { omp_pause_resource_all(omp_pause_hard); }
 static bool must_let_threads_go() {
     Dl_info found;
@@ -51,16 +52,16 @@ PYBIND11_MODULE(_core, m) {
     if (must_let_threads_go() && pthread_atfork(&let_threads_go, nullptr, nullptr) != 0)
         throw std::bad_alloc();
     v3dg::watch_end_of_python();
-    m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
+    m.doc() = "The compiled operations of v3dg. The package v3dg is the public interface.";
     m.attr("min_alpha") = v3dg::kMinAlpha;
     m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
     m.attr("sh_base0") = v3dg::kShBase0;
     m.attr("has_cuda") = v3dg::device_backend() != nullptr;
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
-        "Instruction set that operations on the CPU use.");
+        "The instruction set that operations on the CPU use.");
     m.def("num_cuda_devices", &num_cuda_devices,
-          "Number of CUDA devices; 0 without CUDA or a driver.");
+          "Returns the number of CUDA devices; 0 without CUDA or a driver.");
     v3dg::bind_types(m);
     v3dg::bind_ply(m);
     v3dg::bind_cluster(m);
@@ -72,6 +73,7 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_rasterize(m);
     v3dg::bind_scene(m);
     v3dg::bind_pool(m);
+    v3dg::bind_batch(m);
     v3dg::bind_frame(m);
     v3dg::bind_fit_level(m);
     v3dg::bind_first_selected(m);

@@ -23,7 +23,8 @@ class BoundPool {
     backend::Pool& handle() { return *on_device_; }
     void check_scene(const SceneState& scene) const;
 
-    // See backend::Pool::settle_step().
+    // Makes one step towards a state in which all pages of a view are resident
+    // (backend::Pool::settle_step()).
     SettlingStep settle_step(const py::object& scene_object, const BoundEyes& camera,
                              const SelectRule& rule, bool begins);
 

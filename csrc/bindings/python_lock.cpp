@@ -13,20 +13,21 @@ namespace {
 namespace py = pybind11;
 
 // Serialises the registration of threads with Python. Registration uses state that the
-// ending interpreter destroys, so it is closed before that.
+// interpreter destroys when it ends. `is_closed` becomes true before the interpreter
+// destroys that state, and ends registration.
 struct Entrance {
     std::mutex busy;
     bool is_closed = false;
 };
 
 Entrance& entrance() {
-    // Never destroyed, because threads use it until the process ends.
+    // The mutex is never destroyed, because threads use it until the process ends.
     static Entrance& entrance = *new Entrance;
     return entrance;
 }
 
 void close_entrance() {
-    // a thread that holds the mutex may be waiting for the GIL
+    // A thread that holds the mutex may be waiting for the GIL.
     const Unlocked unlocked;
     const std::lock_guard<std::mutex> lock(entrance().busy);
     entrance().is_closed = true;
@@ -50,8 +51,8 @@ bool call_with_lock(const std::function<void()>& body) {
         return !entrance().is_closed;
     });
     if (!is_open) return false;
-    // Not by a destructor: when Python ends the thread, the destructor would release a
-    // lock that the thread does not hold.
+    // The lock is not released by a destructor: if Python ends the thread, the
+    // destructor would release a lock that the thread does not hold.
     try {
         staying_if_ended(body);
     } catch (...) {

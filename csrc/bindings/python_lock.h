@@ -48,8 +48,8 @@ class Unlocked {
 // without calling it, if the interpreter is ending or has ended.
 bool call_with_lock(const std::function<void()>& body);
 
-// Makes call_with_lock() refuse calls when the interpreter ends. To be called once,
-// when the module is loaded.
+// Makes call_with_lock() refuse calls when the interpreter ends. Call this once, when
+// the module is loaded.
 void watch_end_of_python();
 
 }  // namespace v3dg

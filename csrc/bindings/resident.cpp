@@ -7,7 +7,7 @@
 namespace v3dg {
 
 BoundModel::BoundModel(const Rows& rows) : device_(rows.device()), size_(rows.size()) {
-    static_cast<void>(rows.read<float>());  // checks that they are float32
+    static_cast<void>(rows.read<float>());  // checks that the gaussians are float32
     const Work work(device_);
     model_ = work.backend().make_model(rows, work);
 }
@@ -30,9 +30,9 @@ py::tuple BoundModel::decode(const py::array& cluster_ids) const {
     std::vector<int64_t> offset{0};
     for (const int32_t c : cluster) {
         if (c < 0 || static_cast<size_t>(c) >= num_gaussians_.size())
-            throw std::out_of_range("cluster_ids: expected ids below " +
-                                    std::to_string(num_gaussians_.size()) +
-                                    " and none negative, got " + std::to_string(c));
+            throw std::out_of_range("cluster_ids: expected ids of at least 0 and below " +
+                                    std::to_string(num_gaussians_.size()) + ", got " +
+                                    std::to_string(c));
         offset.push_back(offset.back() + num_gaussians_[c]);
     }
     const Work work(device_);
@@ -74,9 +74,21 @@ void BoundScene::set_bundles(const py::list& bundles) {
     state_ = std::move(state);
 }
 
+// Returns the environment of each instance. None means a scene without environments.
+static std::vector<int32_t> environments_of(const py::object& environments, py::ssize_t count) {
+    if (environments.is_none()) return std::vector<int32_t>(static_cast<size_t>(count), kShared);
+    const Span<const int32_t> given = span_of<const int32_t>(environments, "environments", {count});
+    for (const int32_t e : given)
+        if (e < kShared || e > kMostEnvironment)
+            refuse_value("environments", "expected -1 to " + std::to_string(kMostEnvironment) +
+                                             ", got " + std::to_string(e));
+    return {given.begin(), given.end()};
+}
+
 void BoundScene::set_instances(const py::array& bundle, const py::array& importance,
                                const py::object& positions, const py::object& quaternions,
-                               const py::object& scales, const py::object& factors) {
+                               const py::object& scales, const py::object& factors,
+                               const py::object& environments) {
     auto state = std::make_shared<SceneState>(*state_);
     InstanceTable& instances = state->instances;
     instances.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
@@ -84,6 +96,9 @@ void BoundScene::set_instances(const py::array& bundle, const py::array& importa
     const auto count = static_cast<py::ssize_t>(instances.bundle.size);
     instances.importance = span_of<const float>(importance, "importance", {count});
     instances.factors = factors_of(factors, count);
+    const std::vector<int32_t> environment = environments_of(environments, count);
+    state->environments =
+        std::make_shared<Environments>(Span<const int32_t>{environment.data(), environment.size()});
     state->arrays = py::make_tuple(bundle, importance, positions, quaternions, scales, factors);
     const Work work(device_);
     scene_->set_instances(*state, work);

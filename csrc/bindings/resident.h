@@ -8,6 +8,7 @@
 
 #include "bindings/backend.h"
 #include "bindings/tables.h"
+#include "residency/environments.h"
 
 namespace v3dg {
 
@@ -58,6 +59,8 @@ struct SceneState {
     std::vector<ClusterTable> tables;
     std::vector<size_t> num_gaussians;  // gaussians of each bundle
     InstanceTable instances;            // has poses only if the host can read the arrays
+    std::shared_ptr<const Environments> environments =
+        std::make_shared<Environments>(Span<const int32_t>{});
 
     const BoundTable& bundle(size_t b) const { return held<BoundTable>(bundles[b], "tables"); }
 };
@@ -75,7 +78,8 @@ class BoundScene {
     void set_bundles(const py::list& bundles);
     void set_instances(const py::array& bundle, const py::array& importance,
                        const py::object& positions, const py::object& quaternions,
-                       const py::object& scales, const py::object& factors);
+                       const py::object& scales, const py::object& factors,
+                       const py::object& environments);
     // Sets new poses of the same instances.
     void set_poses(const py::object& positions, const py::object& quaternions,
                    const py::object& scales);

@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// Which gradients with respect to the gaussians' centres are requested.
+// The requested gradients with respect to the gaussians' centres.
 struct Centers {
     bool sum, size;
 };

@@ -124,6 +124,9 @@ void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles);
 // Returns the boundaries of segments, which must ascend from 0 to `last`.
 Span<const int64_t> offsets_of(const py::handle& offset, size_t last);
 
+// Throws ValueError unless the size of an image is valid.
+void check_image_size(int width, int height);
+
 // Returns the requested part of the camera's image.
 Window window_of(const Camera& camera);
 

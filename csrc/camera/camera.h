@@ -35,9 +35,9 @@
 // - width, height: size of the image, px.
 // - near_depth: depth of the near plane; positive. Nothing nearer is drawn.
 // - rounded_to<U>(): the same camera with scalar type U.
-// - scale(factor): multiplies the resolution.
-// - crop(left, top, width, height): makes this rectangle of the image, px, the whole
-//   image. It may extend beyond the old one.
+// - scale(factor): multiplies the resolution by `factor`.
+// - crop(left, top, width, height): replaces the image by a rectangle of the image, px.
+//   The rectangle may extend beyond the image.
 //
 // Projection
 // - depth_of(p): the depth of a point in view space. Gaussians are sorted by depth. A
@@ -255,7 +255,12 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
     V3DG_HD double px2_per_steradian() const {
         return is_pinhole() ? pinhole().px2_per_steradian() : density;
     }
-    // Returns the same view with `factor` times the resolution.
+    // Sets the camera model; the pose and the requested part stay.
+    void set_lens(const Intrinsics<double>& projection) {
+        static_cast<Intrinsics<double>&>(*this) = projection;
+        density = projection.px2_per_steradian();
+    }
+    // Returns this camera with `factor` times the resolution.
     V3DG_HD Camera scaled(double factor) const {
         Camera camera = *this;
         camera.scale(factor);
@@ -266,7 +271,7 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
         camera.density *= factor * factor;
         return camera;
     }
-    // Returns a camera whose whole image is this rectangle of the image, px.
+    // Returns a camera whose image is the given rectangle of this camera's image, px.
     V3DG_HD Camera cropped(double left, double top, double new_width, double new_height) const {
         Camera camera = *this;
         camera.crop(left, top, new_width, new_height);
@@ -277,10 +282,11 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
         return camera;
     }
 };
-static_assert(sizeof(Camera) == 38 * sizeof(double), "nothing but its numbers is compared");
+static_assert(sizeof(Camera) == 38 * sizeof(double),
+              "operator== compares all bytes, so Camera must have no padding");
 
-// Returns a camera with this projection, whose whole image is requested. The caller
-// sets its pose.
+// Returns a camera with the given projection, whose whole image is requested. The
+// caller sets the pose.
 inline Camera with_projection(const Intrinsics<double>& projection) {
     return {CameraPose{}, projection, ImagePart{0, 0, projection.width, projection.height},
             projection.px2_per_steradian()};

@@ -28,8 +28,8 @@ struct SphereImage {
 };
 
 // The projection of a gaussian: the pixel (u, v) and the depth of its mean, and the
-// rows a1 and a2 of the Jacobian times the gaussian's axes in view space. Also the
-// gradients of these values.
+// rows a1 and a2 of the Jacobian times the gaussian's axes in view space. The same
+// struct holds the gradients of these values.
 template <class V>
 struct LinearImage {
     V u, v, depth;

@@ -37,8 +37,8 @@ struct PinholePoint {
 
 // The side planes of a frustum in camera coordinates: right, left, bottom, top. A point
 // is outside of a plane if sign * x > slope * z, or sign * y for bottom and top. With
-// two eyes, each plane has the larger of their slopes, so that a point outside of the
-// plane for both eyes is outside of both frusta.
+// two eyes, each plane has the larger of the two eyes' slopes, so that a point outside
+// of the plane for both eyes is outside of both frusta.
 struct FrustumSides {
     double slope[4];
     float guard[4];  // see Plane::guard
@@ -158,7 +158,8 @@ struct Pinhole {
     }
 
     // Returns the density at the optical axis. The true density grows away from the
-    // axis. This is ignored, so that the cut does not depend on the camera's rotation.
+    // axis. The function ignores the growth, so that the cut does not depend on the
+    // camera's rotation.
     V3DG_HD T px2_per_steradian() const { return fx * fy; }
 
     template <class Eye>

@@ -15,7 +15,7 @@ namespace {
 
 constexpr unsigned kBlockSize = 128, kWarps = kBlockSize / 32;
 constexpr size_t kChunkSize = 4096;  // spheres that a block searches
-static_assert(kCoreSize <= 32, "a lane holds one sphere of the core set");
+static_assert(kCoreSize <= 32, "each of 32 lanes holds one sphere of the core set");
 
 enum class Phase : int { search, measure, done };
 

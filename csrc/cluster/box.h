@@ -21,8 +21,9 @@ struct BoxInput {
 // CUDA compute the same bits.
 namespace cpu { void bound_by_boxes(const BoxInput& in, Span<Box> box); }
 
-// Rows and boxes are on the device, offsets in host memory. Work is enqueued on the
-// stream. Throws std::runtime_error if CUDA reports an error.
+// Like cpu::bound_by_boxes(), with rows and boxes on the device, and offsets in host
+// memory. Work is enqueued on the stream. Throws std::runtime_error if CUDA reports an
+// error.
 namespace cuda { void bound_by_boxes(const BoxInput& in, Span<Box> box, Stream stream); }
 
 }  // namespace v3dg

@@ -1,7 +1,7 @@
 #pragma once
 
 // The box of one gaussian, for the CPU and CUDA. It is compiled without floating-point
-// contraction, so that both compute the same bits.
+// contraction, so that the CPU and CUDA compute the same bits.
 
 #include <cmath>
 
@@ -10,8 +10,8 @@
 
 namespace v3dg {
 
-// Returns the box of what one gaussian draws. Computed in double precision, because
-// scales of one gaussian may be as different as 1e-6 and 1e6.
+// Returns the box of what one gaussian draws. The computation is in double precision,
+// because scales of one gaussian may be as different as 1e-6 and 1e6.
 V3DG_HD inline Box box_of_gaussian(const float* mean, const float* quat, const float* scale) {
     const double q[4] = {quat[0], quat[1], quat[2], quat[3]};
     double r[9];
@@ -23,7 +23,7 @@ V3DG_HD inline Box box_of_gaussian(const float* mean, const float* quat, const f
             const double side = r[3 * a + k] * scale[k];
             variance += side * side;
         }
-        // Add a margin for the rounding of the corners.
+        // Add a margin, because corners are rounded to float32.
         const double reach = kReachSigmas * 1.0001 * sqrt(variance) + 1e-6 * fabs(double(mean[a]));
         box.lo[a] = static_cast<float>(mean[a] - reach);
         box.hi[a] = static_cast<float>(mean[a] + reach);

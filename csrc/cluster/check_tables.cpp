@@ -142,7 +142,7 @@ class Checker {
                 return std::none_of(t_.error.data + 2 * g, t_.error.data + 2 * g + 2,
                                     [](float error) { return error < 0 || std::isinf(error); });
             },
-            "0 or more, or not a number where unknown");
+            "0 or more, or NaN if unknown");
     }
 
     void check_nesting() const {
@@ -159,7 +159,7 @@ class Checker {
                        t_.ball[t_.parent[g]].radius >= needed(g) * (1 - kRounding);
             },
             [&](size_t g) {
-                return "a ball inside that of group " + std::to_string(t_.parent[g]) +
+                return "a ball inside the ball of group " + std::to_string(t_.parent[g]) +
                        ", whose radius must be at least " + shown(needed(g));
             });
         check_rows(
@@ -194,7 +194,7 @@ class Checker {
             if (link >= 0) is_used[link] = 1;
         check_rows(
             "groups", num_groups_, [&](size_t g) { return is_used[g] != 0; },
-            "a cluster with it as " + name);
+            "a cluster that has this group as " + name);
     }
 
     static std::string shown(double number) {

@@ -30,15 +30,15 @@ struct GivenTables {
 
 // The first wrong row of a table. Row -1 means the last row.
 struct TableFault {
-    // name of the table in files; "groups" if a group has no clusters
+    // Name of the table in files; "groups" if a group has no clusters.
     std::string table;
     int64_t row;
     std::string expected;
 };
 
 // Throws TableFault unless the tables are valid. They may have any contents. For exact
-// cuts, the ball and the weight of a group must not be smaller than those of the groups
-// below it, so that the metric never decreases towards the root.
+// cuts, the ball and the weight of a group must not be smaller than the ball and the
+// weight of any group below it, so that the metric never decreases towards the root.
 void check_tables(const GivenTables& tables, int64_t num_gaussians);
 
 }  // namespace v3dg

@@ -15,27 +15,25 @@ namespace v3dg {
 int num_halvings(size_t n, size_t cluster_size);
 
 // Computes where leaves begin if each segment is halved `depth` times. The left half of
-// n points has left_half(n, unit) points.
+// n points has left_half(n, unit) points (cluster_math.h).
 //
 // offset: [S + 1], ascending from 0. unit: >= 1. leaf_offset: [S * 2^depth + 1].
 void halve_segments(Span<const int64_t> offset, int depth, size_t unit, Span<int64_t> leaf_offset);
 
 // Sorts the points of each segment so that the points of each node of a perfect binary
-// tree are contiguous. The leaves of the tree are clusters.
+// tree are contiguous. The leaves of the tree are clusters. docs/levels.md compares the
+// tree with the tree of the paper (V3DG).
 //
 // A node is split at the median along the longest axis of the bounding box of its
 // points; of equal axes, the first one counts. Points of equal coordinate are ordered
 // by index. Leaf l of segment s has the number s * 2^depth + l, and its points are in
-// ascending order of their indices. If the unit is 1, the leaf has floor or ceil of
-// n / 2^depth of the segment's n points. If it is larger, leaves begin at multiples of
-// the unit, counted from the segment's first position, and may be empty. The result has
-// the same bits on the CPU and on CUDA, for any number of threads.
+// ascending order of their indices. If the unit is 1, the leaf has floor or ceil of n /
+// 2^depth of the segment's n points. If the unit is larger, leaves begin at multiples
+// of the unit, counted from the segment's first position, and may be empty. The result
+// has the same bits on the CPU and on CUDA, for any number of threads.
 //
 // means: [N], finite, N < 2^32. offset: [S + 1], ascending from 0 to N. unit: >= 1.
 // order: [N], index of the point at each position. leaf_offset: [S * 2^depth + 1].
-//
-// The tree of clusters is this tree. docs/levels.md compares it with the tree of the
-// paper (V3DG).
 namespace cpu {
 void median_split(Span<const Point> means, Span<const int64_t> offset, int depth, size_t unit,
                   Span<int64_t> order, Span<int64_t> leaf_offset);

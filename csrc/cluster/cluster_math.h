@@ -21,8 +21,8 @@ constexpr double kNestingMargin = 4e-6;
 // The smallest radius of a ball. Squares of it are normal numbers, with full precision.
 constexpr float kMinRadius = 1e-15f;
 
-// Returns how many of a node's points its left half has: half of them, rounded up to a
-// multiple of `unit`, but not more than there are.
+// Returns the number of points in the left half of a node: half of the node's points,
+// rounded up to a multiple of `unit`, but at most all of them.
 constexpr size_t left_half(size_t num_points, size_t unit) {
     const size_t num_units = (num_points + unit - 1) / unit;
     const size_t left = (num_units + 1) / 2 * unit;
@@ -53,7 +53,7 @@ constexpr double kCoreTolerance = 1e-4;
 V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
-    // Move towards the sphere's farthest point, not its centre.
+    // Move the centre towards the farthest point of the sphere, not towards its centre.
     const double move = radius / distance / step;
     center.x += (farthest.x - center.x) * move;
     center.y += (farthest.y - center.y) * move;

@@ -19,7 +19,7 @@ void morton_order(Span<const Point> points, Span<int64_t> order) {
             low.axis[a] = std::min(low.axis[a], point.axis[a]);
             high.axis[a] = std::max(high.axis[a], point.axis[a]);
         }
-    // pairs (code, index), so that equal codes are ordered by index
+    // Pairs of code and index, so that equal codes are ordered by index.
     std::vector<std::pair<uint64_t, int64_t>> keys(points.size);
     parallel_for(points.size, kChunk, [&](size_t i) {
         uint64_t code = 0;

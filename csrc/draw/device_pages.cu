@@ -23,8 +23,8 @@ namespace {
 constexpr float kBringMs = 2.0f;
 constexpr size_t kLeastMeasured = size_t(4) << 20, kLeastBytesAFrame = size_t(8) << 20;
 
-// A page to copy from host memory to the device, and the table entries that give its
-// location. One block of threads copies it.
+// A page to copy from host memory to the device, and the entries of the page table that
+// change with it. One block of threads copies the page.
 struct PageMove {
     const uint4* from;
     uint4* to;
@@ -63,8 +63,8 @@ Pinned<T> pinned(size_t count) {
     return Pinned<T>(static_cast<T*>(memory));
 }
 
-// Returns the number of floats per row of SH coefficients, without those of degree 0,
-// which are in the planes. Rows are aligned to 16 bytes.
+// Returns the number of floats per row of SH coefficients. The coefficients of degree 0
+// are not in the row, but in the planes. Rows are aligned to 16 bytes.
 int stride_of(int sh_degree) {
     return sh_degree == 0 ? 0 : (3 * num_sh_bases(sh_degree) + 3) / 4 * 4;
 }
@@ -73,7 +73,7 @@ int stride_of(int sh_degree) {
 
 void FreePinned::operator()(void* memory) const noexcept {
     if (cudaFreeHost(memory) != cudaSuccess)
-        // Clear the error: at exit, the driver may be unloaded before this object is
+        // Clear the error. At exit the driver may be unloaded before this object is
         // destroyed.
         cudaGetLastError();
 }
@@ -98,7 +98,7 @@ struct DevicePages::Flight {
     bool is_bounded = false;
     size_t bytes_in = 0;
     cudaEvent_t done = nullptr, begun = nullptr,
-                // `begun` and `brought`: before and after copying pages
+                // events before (`begun`) and after (`brought`) the copies of pages
         brought = nullptr;
 
     Flight(size_t most_changes, size_t most_arrivals)
@@ -114,7 +114,9 @@ struct DevicePages::Flight {
     ~Flight() {
         for (cudaEvent_t event : {done, begun, brought})
             if (event != nullptr && cudaEventDestroy(event) != cudaSuccess)
-                cudaGetLastError();  // Clear the error, as FreePinned does.
+                // Clear the error. At exit the driver may be unloaded before this
+                // object is destroyed.
+                cudaGetLastError();
     }
 };
 
@@ -210,8 +212,8 @@ void DevicePages::make_tables(const std::vector<ClusterTable>& host,
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
-// Wait first. Memory is freed in the order of the stream that allocated it, but frames
-// on other streams may still use it.
+// Wait for all streams, because frames on any stream may still read the slots. A buffer
+// is freed only in the order of the stream that allocated it.
 DevicePages::~DevicePages() { busy_.wait(); }
 
 // Passes the page requests of all finished cuts to the pool. Returns the pool's answer

@@ -36,9 +36,9 @@ constexpr size_t kMostFlights = 4;
 size_t packed_row_bytes(int max_sh_degree);
 
 // The gaussians in the slots of a pool, as codes or as packed rows. Pages of any codec
-// can be packed. Frames read the slots and page changes write them; both may use any
-// stream of the device. mutex() must be locked meanwhile, and keeps the streams in the
-// order of locking.
+// can be packed. Frames read the slots and page changes write them, on any stream of
+// the device, while mutex() is locked. The mutex makes the device process this work in
+// the order of locking.
 class DevicePages {
   public:
     // `tables` are on the current device. `host` are the same tables in host memory.
@@ -98,10 +98,12 @@ class DevicePages {
     DeviceBuffer<CodedGaussians> coded_;
     DeviceBuffer<unsigned char> staged_;
     DeviceBuffer<uint8_t> joins_;
-    DeviceBuffer<int64_t> shift_;           // one element per page, over all bundles
-    DeviceBuffer<uint32_t> cluster_shift_;  // likewise; used if the pool keeps codes
-    DeviceBuffer<int32_t> begins_;          // likewise; see PageTable
-    // index of each bundle's first page among the pages of all bundles
+    DeviceBuffer<int64_t> shift_;  // one element per page, over all bundles
+    // One element per page, over all bundles, if the pool keeps codes.
+    DeviceBuffer<uint32_t> cluster_shift_;
+    // One element per page, over all bundles; see PageTable.
+    DeviceBuffer<int32_t> begins_;
+    // Index of each bundle's first page among the pages of all bundles.
     std::vector<size_t> first_page_;
     DeviceBuffer<BundleOnDevice> bundles_;
     DeviceBuffer<uint32_t> words_;

@@ -7,7 +7,8 @@ namespace v3dg {
 
 namespace {
 
-// Adjacent levels differ in hue and in lightness.
+// The colours of levels, the finest first. Adjacent levels differ in hue and in
+// lightness.
 constexpr Rgb kLevels[] = {{0.90f, 0.24f, 0.22f}, {0.98f, 0.60f, 0.17f}, {0.99f, 0.88f, 0.30f},
                            {0.50f, 0.78f, 0.32f}, {0.20f, 0.65f, 0.55f}, {0.26f, 0.65f, 0.90f},
                            {0.27f, 0.40f, 0.80f}, {0.55f, 0.35f, 0.75f}, {0.85f, 0.45f, 0.70f}};

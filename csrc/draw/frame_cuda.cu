@@ -35,7 +35,7 @@ struct Frame::Slot {
             check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Slot() {
-        // Ignore errors: at exit, the driver may be unloaded before this object is
+        // Ignore errors. At exit the driver may be unloaded before this object is
         // destroyed.
         for (const cudaEvent_t event : {begun, prepared, counted, done})
             if (event != nullptr) cudaEventDestroy(event);
@@ -49,8 +49,8 @@ constexpr size_t kEllipseFloats = 8,
                  // together.
     kRecordFloats = 10;
 
-// The number of slots that are allocated in advance. So many frames can be in flight or
-// captured before more are allocated.
+// The number of slots that are allocated in advance. More slots are allocated when more
+// frames are in flight or captured.
 constexpr size_t kSlots = 8;
 
 Frame::Frame(Keeps keeps) : keeps_(keeps) {
@@ -74,13 +74,15 @@ Frame::Slot* Frame::take_slot(bool capturing) {
     if (free_slots_.empty() || waits) {
         cudaGetLastError();
         if (capturing)
-            throw std::runtime_error("frame: expected at most " + std::to_string(kSlots) +
-                                     " frames in flight or captured");
+            throw std::runtime_error(
+                "frame: expected at most " + std::to_string(kSlots) +
+                " captured frames and frames in flight, got one more; finish one first");
         slots_.push_back(std::make_unique<Slot>());
         return slots_.back().get();
     }
     Slot* slot = free_slots_.front();
     free_slots_.pop_front();
+    std::erase(unchecked_, slot);
     return slot;
 }
 
@@ -104,8 +106,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
         if (is_full(capacity, count, 8)) capacity = std::max(capacity, count + count / 8);
     };
-    // If gaussians exceed their capacity, entries were not counted. Most scenes have
-    // one or two entries per gaussian.
+    // If the gaussians exceed their capacity, no entries were counted, so estimate
+    // their number: most scenes have one or two entries per gaussian.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
     grow(capacity_.items, counters.items);
     grow(capacity_.records, counters.gaussians);
@@ -128,22 +130,45 @@ void Frame::enlarge(const FrameCounters& counters) {
     trim_pool(last_stream_);
 }
 
+void Frame::release_buffers() {
+    if (was_captured_) return;
+    capacity_ = kFirstCapacity;
+    items_ = {};
+    item_records_ = {};
+    item_tiles_ = {};
+    records_ = {};
+    boxes_ = {};
+    large_ = {};
+    entries_ = {};
+    scratch_ = {};
+    trim_pool(last_stream_);
+}
+
 std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
                                      const Place& place) {
     std::unique_ptr<Drawing> drawing(new Drawing(*this, batch, std::move(prepare), stream));
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
+    if (!drawing->is_captured_) check_counts();
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the last frame exceeded or nearly filled a buffer, this one is likely to do
-    // so, too. So enlarge the buffers first, if the last frame's counts are known.
-    if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
-        const cudaError_t over = cudaEventQuery(last_->slot_->done);
-        if (over == cudaSuccess) enlarge(*last_->slot_->counters);
-        if (over != cudaSuccess && over != cudaErrorNotReady) check(over, "a frame");
-    }
     enqueue(*drawing, place);
-    last_ = drawing.get();
+    if (!drawing->is_captured_) unchecked_.push_back(drawing->slot_);
     return drawing;
+}
+
+void Frame::check_counts() {
+    std::vector<const Slot*> done;
+    std::erase_if(unchecked_, [&done](const Slot* slot) {
+        const cudaError_t over = cudaEventQuery(slot->done);
+        if (over == cudaErrorNotReady) {
+            cudaGetLastError();
+            return false;
+        }
+        check(over, "a frame");
+        done.push_back(slot);
+        return true;
+    });
+    for (const Slot* slot : done) enlarge(*slot->counters);
 }
 
 void Frame::enqueue(Drawing& drawing, const Place& place) {
@@ -204,7 +229,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
              .has_faded_items = batch.has_faded_items,
              .has_lenses = batch.has_lenses,
              .factors = batch.factors,
-             .num_factors = batch.num_factors},
+             .num_factors = batch.num_factors,
+             .image_counts = batch.image_counts},
             {.records = planes,
              .few = few,
              .item_records = item_records,
@@ -246,6 +272,7 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     }
     if (place) place(drawing.planes_);
     of_frame.has_depth = batch.has_depth;
+    of_frame.num_marked = batch.marks_undrawn ? batch.num_images : 0;
     for (int k = 0; k < 2; ++k) {
         of_frame.planes[k] = drawing.planes_[k];
         of_frame.has_depth = of_frame.has_depth || drawing.planes_[k].depth != nullptr;
@@ -309,7 +336,6 @@ Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, 
     : frame_(frame), batch_(batch), prepare_(std::move(prepare)), stream_(stream) {}
 
 Drawing::~Drawing() {
-    if (frame_.last_ == this) frame_.last_ = nullptr;
     // A captured graph continues to write to its slot.
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }
@@ -346,6 +372,12 @@ const FrameCounters& Drawing::settle() {
         ++num_draws_;
     }
     return *slot_->counters;
+}
+
+bool Drawing::finish_or_enlarge() {
+    wait();
+    if (!was_drawn()) frame_.enlarge(*slot_->counters);
+    return was_drawn();
 }
 
 FrameTimes Drawing::times() const {

@@ -23,25 +23,30 @@ struct FrameBatch {
     const Placement* placements;
     const FrameImage* images;
     uint32_t num_images, num_tiles;  // `num_tiles`: total over all images
-    // See ProjectInput for these two.
+    // Packed and coded models (see ProjectInput).
     const PackedPlanes* packed = nullptr;
     const CodedGaussians* coded = nullptr;
-    // whether any item may be shared; must be false with a tape
+    // Whether any item may be shared; must be false with a tape.
     bool has_shared_items = false;
     float min_transmittance = kStopsBefore;  // the same for all images
-    // Whether any item may have a weight below 1. Only the items of scenes can; those
-    // that do are not shared.
+    // Whether any item may have a weight below 1. Such items occur only in scenes, and
+    // are never shared.
     bool has_faded_items = false;
     bool has_lenses = false;  // whether the camera of any image is not a pinhole
-    // [num_factors], see ProjectInput; or null
+    // [num_factors] as in ProjectInput; may be null
     const InstanceFactors* factors = nullptr;
     uint32_t num_factors = 0;
     // The mutex that guards the models, if they change between frames; else null. The
     // caller must hold it during draw().
     StreamMutex* guards_models = nullptr;
     size_t num_zeros = 0;  // size of ItemList::zeros
-    // Whether depth is drawn in any image that gets its destination later.
+    // Whether depth is drawn in any of the images that get their destination from a
+    // Place.
     bool has_depth = true;
+    ImageCounts* image_counts = nullptr;  // as in ProjectInput
+    // Whether images become NaN if they are not drawn because a buffer is too small.
+    // All of them have planes.
+    bool marks_undrawn = false;
 };
 
 // The results of a frame that its backward pass needs. Valid until the next frame is
@@ -54,7 +59,7 @@ struct FrameTape {
     const DrawItem* items;         // counters->items elements
     const uint32_t* item_records;  // number of records of each item
     const uint32_t* source;        // index of each record's gaussian in the model
-    // first gradient slot of each record, set by place_slots()
+    // First gradient slot of each record, set by place_slots().
     const uint32_t* first_slot;
 };
 
@@ -81,8 +86,8 @@ class Frame {
     Frame& operator=(const Frame&) = delete;
 
     // A function that enqueues the work to write the batch's items and the tables that
-    // do not exist yet. It is called again if the frame is drawn again. All counters
-    // are zero before that work runs.
+    // do not exist yet. If the frame is drawn again, the function is called again. All
+    // counters are zero before that work runs.
     using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
 
     // A function that sets the destinations of images that have none. It is called
@@ -98,6 +103,10 @@ class Frame {
     // Returns the device memory in bytes, by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
+    // Frees the buffers, so that a smaller frame fits. Does nothing if a graph was
+    // captured, because the graph may still use the buffers.
+    void release_buffers();
+
     // Returns the tape of the last frame. Precondition: the frame keeps a tape.
     FrameTape tape() const;
 
@@ -109,13 +118,18 @@ class Frame {
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
+    // Enlarges the buffers if an earlier, finished frame exceeded or nearly filled one.
+    // The next frame is then likely to exceed it, too. The drawing of the earlier frame
+    // may have been destroyed.
+    void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
     template <class T>
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
 
     const Keeps keeps_;
-    Capacity capacity_{64, 4096, 4096, 4096, 4096};
+    static constexpr Capacity kFirstCapacity{64, 4096, 4096, 4096, 4096};
+    Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
     DeviceBuffer<float> records_;
@@ -129,16 +143,17 @@ class Frame {
     uint32_t num_plans_ = 0;
     // State, scan state, zeros for items, tile counts
     DeviceBuffer<unsigned char> cleared_;
-    // the first bytes of `cleared_` that are zero when the next frame starts
+    // The first bytes of `cleared_` that are zero when the next frame starts.
     size_t num_zero_bytes_ = 0;
 
     std::vector<std::unique_ptr<Slot>> slots_;
-    // may belong to frames that are still drawn on the device
+    // The device may still be drawing frames of free slots.
     std::deque<Slot*> free_slots_;
-    // buffers that captured graphs may still use
+    // Buffers that captured graphs may still use.
     std::vector<std::shared_ptr<void>> retired_;
     bool was_captured_ = false;
-    Drawing* last_ = nullptr;
+    // Slots of frames whose counts were not compared with the buffers.
+    std::vector<Slot*> unchecked_;
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
     StreamMutex busy_;
@@ -165,6 +180,11 @@ class Drawing {
     // For a captured frame, it returns the counters of the last replay, which must have
     // ended. It throws std::runtime_error if a buffer was too small for that replay.
     const FrameCounters& finish();
+    // Waits for the drawing, and returns whether it was drawn. If a buffer was too
+    // small, enlarges the buffer, so that the caller can draw a new frame instead.
+    // Throws like finish(). Not allowed for a captured frame.
+    bool finish_or_enlarge();
+    bool is_captured() const { return is_captured_; }
     FrameTimes times() const;
     // Returns how often the frame was drawn; more than once if a buffer was too small.
     // Valid after finish().
@@ -180,7 +200,7 @@ class Drawing {
     Frame::Prepare prepare_;
     cudaStream_t stream_;
     Frame::Slot* slot_ = nullptr;
-    Capacity capacity_{};  // capacity of the buffers when it was enqueued
+    Capacity capacity_{};  // capacity of the buffers when the frame was enqueued
     PicturePlanes planes_[2]{};
     bool is_captured_ = false, is_settled_ = false;
     int num_draws_ = 1;

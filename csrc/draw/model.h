@@ -6,7 +6,7 @@
 
 namespace v3dg {
 
-// The gaussians of a model in planes (one array per component), which it owns.
+// The gaussians of a model, in planes (one array per component) that the model owns.
 template <class T>
 class Model {
   public:

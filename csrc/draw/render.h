@@ -23,7 +23,7 @@ struct Workspace {
     TileLists lists;
     size_t num_chunks = 0;
     uint64_t room = 0;  // length of the used part of `records`, including gaps
-    // largest `room` so far, and thus the memory that was ever touched
+    // Largest `room` so far, and thus the memory that was ever touched.
     uint64_t most_room = 0;
 };
 
@@ -60,9 +60,9 @@ struct Pick {
 bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera, int x, int y,
           Pick& picked);
 
-// Computes the gradients of the gaussians of a single draw. `workspace` must be that of
-// the picture's render() call. Writes, but does not accumulate: `out` and `centers` are
-// overwritten for gaussians with a record, and unchanged for others.
+// Computes the gradients of the gaussians of a single draw. `workspace` must be the
+// workspace of the picture's render() call. Gradients are overwritten, not accumulated.
+// `out` and `centers` do not change for gaussians without a record.
 template <class T>
 void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& workspace,

@@ -22,7 +22,7 @@ DifferentiableFrame::DifferentiableFrame() : frame_(Frame::Keeps::tape) {
 DifferentiableFrame::~DifferentiableFrame() {
     for (const cudaEvent_t event : {drawn_, gone_back_})
         if (event != nullptr) cudaEventDestroy(event);
-    // Ignore errors: at exit, the driver may be unloaded before this object is
+    // Ignore errors. At exit the driver may be unloaded before this object is
     // destroyed.
     cudaGetLastError();
 }
@@ -76,8 +76,8 @@ struct IdleFrames {
 };
 
 IdleFrames& idle_frames() {
-    // Never destroyed: at exit, the driver may be unloaded before static objects are
-    // destroyed.
+    // The object is never destroyed: at exit, the driver may be unloaded before static
+    // objects are destroyed.
     static IdleFrames& frames = *new IdleFrames;
     return frames;
 }

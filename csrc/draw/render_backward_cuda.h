@@ -47,8 +47,8 @@ class DifferentiableFrame {
     cudaEvent_t drawn_ = nullptr, gone_back_ = nullptr;
 };
 
-// Returns a frame for the current device: one that was given back, if there is any. A
-// frame must not be given back after an error.
+// Returns a frame for the current device. It reuses a frame of give_back() if there is
+// one. A frame must not be given back after an error.
 std::unique_ptr<DifferentiableFrame> take_frame();
 void give_back(std::unique_ptr<DifferentiableFrame> frame);
 

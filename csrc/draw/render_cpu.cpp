@@ -81,8 +81,8 @@ class RecordRoom {
             longest_ = std::max(longest_, end - pieces[c.first].first);
             total = end;
         }
-        // A thread takes a new strip when the longest chunk does not fit in its current
-        // one. So the gaps are at most an eighth of the strips.
+        // A thread takes a new strip when its current strip has no room for the longest
+        // chunk. So the gaps are at most an eighth of the strips.
         strip_ = 8 * longest_;
         size_ = total + total / 7 + (mine_.size() + 1) * strip_;
         if (size_ > UINT32_MAX)
@@ -114,8 +114,8 @@ class RecordRoom {
     std::vector<Strip> mine_;
 };
 
-// Returns the tiles, those with the longest lists first, so that no thread starts a
-// long list at the end.
+// Returns the tiles in falling order of the length of their lists, so that no thread
+// starts a long list at the end.
 static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_tiles) {
     std::vector<uint32_t> order(num_tiles);
     std::iota(order.begin(), order.end(), 0);
@@ -127,16 +127,16 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 
 // The approximate bytes of the records and entries of one band. Records are accessed
 // randomly, so smaller bands use caches better; but a band must have tiles for all
-// threads. If there is a `stop` flag, bands have the smallest size, because the flag is
-// rarely checked within a band.
+// threads. Bands have the smallest size in two cases: if there is a `stop` flag,
+// because the flag is rarely checked within a band, and if each thread draws a picture.
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
-    if (stop != nullptr) return kLeastBandBytes;
+    if (stop != nullptr || omp_in_parallel() != 0) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
-// The number of gaussians up to which a picture is drawn in a single band, without an
-// estimate.
+// Pictures with at most this many gaussians are drawn in a single band, because they
+// need little memory.
 constexpr uint64_t kFewGaussians = 65536;
 
 // Divides a window into bands of tile rows with about equally many bytes of records and
@@ -258,8 +258,8 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
                         static_cast<size_t>(picture.window.width());
     Picture<T> part = picture;
     part.window = band;
-    part.color += 3 * skip;
-    part.alpha += skip;
+    part.color += picture.color_step * skip;
+    if (part.alpha != nullptr) part.alpha += picture.alpha_step * skip;
     if (part.depth != nullptr) part.depth += skip;
     if (part.count != nullptr) part.count += skip;
     return part;

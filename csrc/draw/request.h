@@ -30,26 +30,36 @@ struct Shade {
 };
 
 struct FrameRequest {
-    Eyes eyes;        // the camera of each picture
-    SelectRule rule;  // rule of the cut; with `cut`, only the tolerance for `metrics`
+    Eyes eyes;  // the camera of each picture
+    // The rule of the cut. With a given `cut`, only false colours use the rule.
+    SelectRule rule;
     Shade shade;
     FrameLook look = FrameLook::appearance;
     std::optional<GivenCut> cut = {};  // a cut to draw instead of selecting one
-    // eyes for which the cut is selected; default: `eyes`
+    // Eyes for which the cut is selected; default: `eyes`.
     std::optional<Eyes> chooser = {};
-    // With a pool: draw with the pages that are resident, without loading or requesting
-    // any.
+    // Whether a frame with a pool draws only the pages that are resident, and neither
+    // brings in nor requests any pages.
     bool is_aside = false;
     // Per bundle: the colours of clusters in host memory, as SH coefficients of degree
     // 0, [C][3]. An empty vector keeps the gaussians' colours.
     std::vector<const float*> cluster_colors = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
-    // Whether every backend can draw the request. Other requests are drawn on the host
-    // only.
+    // Returns whether every backend can draw the request. Other requests are drawn on
+    // the host only.
     bool is_plain() const {
         return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
     }
+};
+
+// The request for pictures of one size, each with a cut for its own camera. The rule
+// has no budget.
+struct BatchRequest {
+    SelectRule rule;
+    Shade shade;  // ignores `with_depth`: depth is drawn if there are planes for it
+    int width, height;
+    BatchPlanes planes;
 };
 
 }  // namespace v3dg

@@ -7,6 +7,7 @@
 
 #include "draw/render.h"
 #include "draw/request.h"
+#include "residency/environments.h"
 
 namespace v3dg {
 
@@ -26,20 +27,29 @@ struct HostScene {
     Span<const ClusterTable> tables;
     Span<const SceneModel> models;  // one per table
     InstanceTable instances;
-    // See SelectInput for these two.
+    // Optional outputs of selection (see SelectInput).
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
+    Span<const ClusterRuns> runs = {};
+};
+
+// The cameras of a batch on the host. They have the size of the request, and belong to
+// environments of the scene.
+struct HostCameras {
+    Span<const Camera> camera;        // [B]
+    Span<const int32_t> environment;  // [B] as in EnvironmentTable
+    EnvironmentTable environments;    // the environments of the scene's instances
 };
 
 // The counts of one frame.
 struct SceneFrameCounts {
-    // selected gaussians; if exceeds_budget, those of the coarsest cut
+    // Selected gaussians. If exceeds_budget, the gaussians of the coarsest cut.
     int64_t gaussians;
     float tolerance_px2;  // tolerance of the cut
     bool exceeds_budget;  // if true, nothing was drawn
     double select_seconds, draw_seconds;
     RenderCounts render;  // sums over both pictures of a stereo frame
-    // selected gaussians of each level; not set by draw_model()
+    // Selected gaussians of each level; not set by draw_model().
     std::vector<int64_t> levels;
 
     // Adds the counts of the second picture of a stereo frame.
@@ -72,13 +82,20 @@ SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, Span<const Picture<float>> pictures,
                             const std::atomic<bool>* stop = nullptr);
 
+// Draws a picture for each camera. The decisions and the pixels are equal to those of
+// draw_scene() for the instances that the camera sees. Each thread draws the pictures
+// of some cameras. If the remaining cameras are fewer than the threads, all threads
+// together draw one picture after another.
+void draw_batch(const HostScene& scene, const BatchRequest& request, const HostCameras& cameras,
+                Span<SceneFrameCounts> counts);
+
 // Draws all gaussians of one model, in world coordinates.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count,
                             const Appearance<float>& appearance, const Camera& camera,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
 // Finds the gaussian with the largest blend weight in the first pixel of the first
-// eye's window. The cut is that of draw_scene(). Returns whether any gaussian is drawn
+// eye's window, in the cut of draw_scene(). Returns whether any gaussian is drawn
 // there.
 bool pick_scene(const HostScene& scene, const FrameRequest& request, const SelectRule& rule,
                 ScenePick& picked);

@@ -8,7 +8,10 @@
 #include <stdexcept>
 #include <string>
 
+#include <omp.h>
+
 #include "base/clock.h"
+#include "base/parallel_for.h"
 #include "draw/false_color.h"
 #include "math/sh.h"
 
@@ -21,7 +24,8 @@ namespace {
 // stay locked in the child of a fork().
 class SharedWorkspace {
   public:
-    // Exchanged atomically: threads may still be drawing when the process exits.
+    // The exchange is atomic, because threads may still be drawing when the process
+    // exits.
     ~SharedWorkspace() { delete kept_.exchange(nullptr); }
     std::unique_ptr<Workspace<float>> take() {
         std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
@@ -42,15 +46,19 @@ SharedWorkspace& shared_workspace() {
     return shared;
 }
 
-SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& camera,
-                          const Picture<float>& picture, const std::atomic<bool>* stop) {
-    SceneFrameCounts counts{};
-    std::unique_ptr<Workspace<float>> workspace = shared_workspace().take();
-    counts.render =
-        render<float>(draws, camera.intrinsics<float>(), picture, false, *workspace, stop);
-    shared_workspace().give_back(std::move(workspace));
-    return counts;
-}
+// The shared workspace, borrowed until this object is destroyed.
+class LentWorkspace {
+  public:
+    LentWorkspace() : workspace_(shared_workspace().take()) {}
+    ~LentWorkspace() { shared_workspace().give_back(std::move(workspace_)); }
+    LentWorkspace(const LentWorkspace&) = delete;
+    LentWorkspace& operator=(const LentWorkspace&) = delete;
+
+    Workspace<float>& operator*() const { return *workspace_; }
+
+  private:
+    std::unique_ptr<Workspace<float>> workspace_;
+};
 
 // Converts the clusters of a cut to draws. Clusters of one instance become a single
 // draw if their rows are adjacent and their appearance and weights are equal. `tint`
@@ -149,10 +157,12 @@ void set_tint(const Rgb& rgb, float* tint) {
 
 SceneFrameCounts draw_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
                             const float* tint, const Picture<float>& picture,
-                            const std::atomic<bool>* stop) {
+                            Workspace<float>& workspace, const std::atomic<bool>* stop) {
     const double start = now();
     const CutDraws cut(scene, camera, given, tint);
-    SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
+    SceneFrameCounts counts{};
+    counts.render =
+        render<float>(cut.draws(), camera.intrinsics<float>(), picture, false, workspace, stop);
     counts.gaussians = cut.num_gaussians();
     counts.draw_seconds = now() - start;
     return counts;
@@ -184,8 +194,9 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
     // Metrics depend on the eye that views the picture; missing pages on the eye for
     // which the cut was selected.
     const Camera& judge = is_metric ? request.eyes.camera[0] : request.choosing_eyes().camera[0];
-    // Compare with the requested tolerance: the pool may have raised the tolerance of
-    // the cut. With a budget, there is no requested tolerance, so use that of the cut.
+    // The tolerance that the tints show. For missing pages without a budget, it is the
+    // requested tolerance, because the pool may have raised the tolerance of the cut.
+    // Otherwise, it is the tolerance of the cut.
     const bool wants_used = is_metric || rule.budget != kNoBudget;
     const float wanted = wants_used ? tolerance_px2 : request.rule.tolerance_px2;
     std::vector<float> tint(3 * given.instance.size);
@@ -195,7 +206,7 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
-        // 1.0001: a margin for the rounding of metrics.
+        // 1.0001 is a margin for the rounding of metrics.
         const Rgb rgb =
             is_metric ? Rgb{grey, grey, grey}
                       : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
@@ -217,7 +228,8 @@ void select_for(const HostScene& scene, const FrameRequest& request, const Selec
                  .eyes = request.choosing_eyes(),
                  .rule = rule,
                  .needs = scene.needs,
-                 .last_bin = scene.last_bin},
+                 .last_bin = scene.last_bin,
+                 .runs = scene.runs},
                 out);
 }
 
@@ -232,12 +244,14 @@ SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
         static_cast<void>(CutDraws(scene, camera, given));
         tint = tint_of(scene, request, rule, given, rule.tolerance_px2);
     }
-    return draw_pairs(scene, camera, given, tint.empty() ? nullptr : tint.data(), picture, stop);
+    const LentWorkspace workspace;
+    return draw_pairs(scene, camera, given, tint.empty() ? nullptr : tint.data(), picture,
+                      *workspace, stop);
 }
 
 SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& request,
                                const SelectRule& rule, Span<const Picture<float>> pictures,
-                               const std::atomic<bool>* stop) {
+                               Workspace<float>& workspace, const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
     select_for(scene, request, rule, cut);
@@ -248,7 +262,8 @@ SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& reque
     SceneFrameCounts counts{};
     for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
         counts.add_picture(draw_pairs(scene, request.eyes.camera[k], given,
-                                      tint.empty() ? nullptr : tint.data(), pictures[k], stop));
+                                      tint.empty() ? nullptr : tint.data(), pictures[k], workspace,
+                                      stop));
     counts.gaussians = cut.num_gaussians;
     counts.tolerance_px2 = cut.tolerance_px2;
     counts.exceeds_budget = !cut.fits_budget;
@@ -257,21 +272,106 @@ SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& reque
     return counts;
 }
 
+// The instances of a scene that one camera sees, in the order of their slots.
+class SeenInstances {
+  public:
+    SeenInstances(const InstanceTable& all, const EnvironmentTable& environments,
+                  int32_t environment) {
+        const int32_t count = environments.num_slots(environment);
+        for (int32_t slot = 0; slot < count; ++slot) {
+            const auto i = static_cast<size_t>(environments.instance_of(environment, slot));
+            bundle_.push_back(all.bundle[i]);
+            position_.insert(position_.end(), &all.position[3 * i], &all.position[3 * i] + 3);
+            quaternion_.insert(quaternion_.end(), &all.quaternion[4 * i],
+                               &all.quaternion[4 * i] + 4);
+            scale_.push_back(all.scale[i]);
+            importance_.push_back(all.importance[i]);
+            if (!all.factors.empty()) factors_.push_back(all.factors[i]);
+        }
+    }
+    InstanceTable table() const {
+        return {.bundle = {bundle_.data(), bundle_.size()},
+                .position = {position_.data(), position_.size()},
+                .quaternion = {quaternion_.data(), quaternion_.size()},
+                .scale = {scale_.data(), scale_.size()},
+                .importance = {importance_.data(), importance_.size()},
+                .factors = {factors_.data(), factors_.size()}};
+    }
+
+  private:
+    std::vector<int32_t> bundle_;
+    std::vector<double> position_, quaternion_, scale_;
+    std::vector<float> importance_;
+    std::vector<InstanceFactors> factors_;
+};
+
+// Returns the picture of camera k in the planes of a batch.
+Picture<float> picture_of(const BatchRequest& request, size_t k) {
+    const size_t num_pixels = static_cast<size_t>(request.width) * request.height;
+    const BatchPlanes planes = request.planes.from(k * num_pixels);
+    const std::array<double, 3>& color = request.shade.background;
+    return {.window = {0, 0, request.width, request.height},
+            .background = {float(color[0]), float(color[1]), float(color[2])},
+            .color = planes.color,
+            .alpha = planes.alpha_plane(),
+            .depth = planes.depth,
+            .count = nullptr,
+            .min_transmittance = request.shade.min_transmittance,
+            .color_step = planes.channels,
+            .alpha_step = planes.alpha_step()};
+}
+
+// Draws the picture of camera k.
+SceneFrameCounts draw_picture(const HostScene& scene, const BatchRequest& request,
+                              const HostCameras& cameras, size_t k, Workspace<float>& workspace) {
+    const FrameRequest one{.eyes = cameras.camera[k], .rule = request.rule, .shade = request.shade};
+    const Picture<float> picture = picture_of(request, k);
+    const int32_t environment = cameras.environment[k];
+    if (environment == kSeesAll)
+        return draw_selected(scene, one, request.rule, {&picture, 1}, workspace, nullptr);
+    const SeenInstances seen(scene.instances, cameras.environments, environment);
+    HostScene part = scene;
+    part.instances = seen.table();
+    return draw_selected(part, one, request.rule, {&picture, 1}, workspace, nullptr);
+}
+
 }  // namespace
 
 SceneFrameCounts cpu::draw_scene(const HostScene& scene, const FrameRequest& request,
                                  const SelectRule& rule, Span<const Picture<float>> pictures,
                                  const std::atomic<bool>* stop) {
     if (request.cut) return draw_given(scene, request, rule, pictures[0], stop);
-    return draw_selected(scene, request, rule, pictures, stop);
+    const LentWorkspace workspace;
+    return draw_selected(scene, request, rule, pictures, *workspace, stop);
+}
+
+void cpu::draw_batch(const HostScene& scene, const BatchRequest& request,
+                     const HostCameras& cameras, Span<SceneFrameCounts> counts) {
+    const size_t count = cameras.camera.size, num_threads = static_cast<size_t>(most_threads());
+    HostScene shared = scene;
+    const size_t num_spread = count / num_threads * num_threads;
+    const std::vector<ClusterRuns> runs = runs_of_bundles(scene.tables, scene.instances, count);
+    shared.runs = {runs.data(), runs.size()};
+    std::vector<Workspace<float>> workspaces(std::min(count, num_threads));
+    const auto draw = [&](size_t k) {
+        // A nested parallel loop has one thread, whose number is 0.
+        Workspace<float>& workspace = workspaces[omp_get_thread_num()];
+        counts[k] = draw_picture(shared, request, cameras, k, workspace);
+    };
+    parallel_for(num_spread, 1, draw);
+    for (size_t k = num_spread; k < count; ++k) draw(k);
 }
 
 SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count,
                                  const Appearance<float>& appearance, const Camera& camera,
                                  const Picture<float>& picture, const std::atomic<bool>* stop) {
     const double start = now();
-    SceneFrameCounts counts = draw_all(
-        {{&model, 0, count, view_of_world<float>(camera), appearance}}, camera, picture, stop);
+    const std::vector<Draw<float>> draws{
+        {&model, 0, count, view_of_world<float>(camera), appearance}};
+    const LentWorkspace workspace;
+    SceneFrameCounts counts{};
+    counts.render =
+        render<float>(draws, camera.intrinsics<float>(), picture, false, *workspace, stop);
     counts.gaussians = static_cast<int64_t>(count);
     counts.draw_seconds = now() - start;
     return counts;

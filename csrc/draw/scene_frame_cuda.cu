@@ -180,8 +180,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
-            // When a frame is drawn again, another frame may already be reporting page
-            // requests; so this one must not.
+            // A frame that is drawn again reports no page requests, because the next
+            // frame may already be reporting its own.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },
@@ -205,7 +205,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene, const 
 std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
     auto parts = frame_.bytes();
     const size_t tables = rows_.bytes() + packed_.bytes() + coded_.bytes() + images_.bytes();
-    parts.emplace_back("placements", placements_.bytes() + tables);
+    parts.emplace_back("placements", placements_.bytes() + factors_.bytes() + tables);
     parts.emplace_back("cut", cut_.bytes());
     return parts;
 }

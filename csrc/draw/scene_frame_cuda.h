@@ -1,7 +1,7 @@
 #pragma once
 
-// Frames of a scene on a CUDA device. They enqueue the drawing of a request. Also the
-// models that they draw.
+// Frames of a scene on a CUDA device, which enqueue the drawing of a request, and the
+// models that frames draw.
 
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
@@ -72,7 +72,19 @@ class DevicePalette {
 // Combines the pictures of two eyes into one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
-// Draws a scene that is on the device: selects a cut, then draws it.
+// The memory of a batch in progress: copies of its cameras, and the counts of its
+// images.
+struct BatchTables {
+    BatchTables(uint32_t num_cameras, cudaStream_t stream)
+        : cameras(num_cameras, stream), counts(num_cameras, stream) {}
+
+    DeviceBuffer<BatchCamera> cameras;
+    DeviceBuffer<ImageCounts> counts;
+};
+
+class BatchDrawing;
+
+// Draws a scene whose tables are on the device: selects a cut, then draws the cut.
 class SceneFrame {
   public:
     // Sets the gaussians of each bundle of the scene and, unless `palettes` is empty,
@@ -94,10 +106,26 @@ class SceneFrame {
                                   const EyeImages& pictures, cudaStream_t stream,
                                   const Frame::Place& place);
 
+    // Draws a picture for each camera of a batch, in parts if the batch is large. Like
+    // draw(), but it writes the planes of the request. The first kernels read the
+    // cameras.
+    std::unique_ptr<BatchDrawing> draw_batch(const SceneTables& scene, const BatchRequest& request,
+                                             const CameraArrays& arrays, uint32_t num_cameras,
+                                             cudaStream_t stream);
+
     // Returns the device memory in bytes, by part, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
   private:
+    friend class BatchDrawing;
+    // Returns memory that no other batch in progress uses.
+    std::shared_ptr<BatchTables> tables_for(uint32_t num_cameras, cudaStream_t stream);
+    // Draws cameras [first, first + count) of a batch.
+    std::unique_ptr<Drawing> draw_part(const BatchDrawing& batch, uint32_t first, uint32_t count,
+                                       CameraSource source);
+    // Halves the number of cameras of all later parts.
+    void halve_parts(uint32_t num_cameras);
+
     std::unique_ptr<Drawing> draw_selected(const SceneTables& scene, const Eyes& eyes,
                                            const SelectRule& rule, const EyeImages& pictures,
                                            cudaStream_t stream, const Frame::Place& place);
@@ -119,9 +147,54 @@ class SceneFrame {
     DeviceBuffer<CodedGaussians> coded_;
     bool has_packed_ = false, has_coded_ = false;
     DeviceBuffer<Placement> placements_;
+    DeviceBuffer<InstanceFactors> factors_;  // one per place of a batch
     DeviceBuffer<FrameImage> images_;
+    uint32_t most_cameras_ = ~0u;                       // largest number of cameras in a part
+    std::vector<std::shared_ptr<BatchTables>> tables_;  // memory of batches
+    // Memory that captured graphs continue to use.
+    std::vector<std::shared_ptr<BatchTables>> captured_tables_;
     Cut cut_;
     Frame frame_;
+};
+
+// A batch that was enqueued. The frame, the scene and the planes must outlive it.
+class BatchDrawing {
+  public:
+    // Waits until the device has finished. finish() may still draw parts of the batch
+    // again.
+    void wait() const;
+    // Waits until the pictures are drawn. Parts for which a buffer was too small are
+    // drawn again, in smaller parts if memory does not suffice. Throws OutOfMemory or
+    // std::length_error if memory does not suffice for a single camera.
+    void finish();
+    // Returns the counts of each image. Waits. Call it after finish().
+    std::vector<ImageCounts> counts() const;
+    // Returns the sum over all parts. Call it after finish().
+    FrameTimes times() const;
+    size_t num_parts() const { return parts_.size(); }
+    bool is_captured() const { return is_captured_; }
+
+  private:
+    friend class SceneFrame;
+    struct Part {
+        uint32_t first, count;
+        std::unique_ptr<Drawing> drawing;
+    };
+    BatchDrawing(SceneFrame& frame, const SceneTables& scene, const BatchRequest& request,
+                 const CameraArrays& arrays, uint32_t num_cameras, cudaStream_t stream);
+    // Draws the cameras from `first` on, in parts.
+    void enqueue(uint32_t first, uint32_t count);
+    void finish_part(Part part, std::vector<Part>& finished);
+
+    SceneFrame& frame_;
+    const SceneTables& scene_;
+    const BatchRequest request_;
+    const CameraArrays arrays_;
+    const uint32_t num_cameras_;
+    const std::shared_ptr<BatchTables> tables_;
+    const cudaStream_t stream_;
+    const bool is_captured_;
+    std::vector<Part> parts_;
 };
 
 // A model, and the camera in front of which it is placed.

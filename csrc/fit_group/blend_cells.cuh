@@ -76,7 +76,7 @@ __device__ CellRecords records_at(const Fit& fit, const CellList<Fit>& list, uin
     return out;
 }
 
-// How kAtOnce gaussians contribute to a pixel, front to back.
+// The contributions of kAtOnce gaussians to a pixel, front to back.
 struct Blended {
     float alpha[kAtOnce], before[kAtOnce], weight[kAtOnce];
     float3 color[kAtOnce];
@@ -99,7 +99,7 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     return out;
 }
 
-// The outputs of a pass. Those of other passes are unused.
+// The outputs of a pass. A pass leaves the outputs of other passes unused.
 struct BlendTargets {
     float* slots;          // for Pass::train
     uint32_t slot_base;    // index of the first slot in `slots`
@@ -230,8 +230,8 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     }
     fit.d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
-    // Blend the same records again, with the same results. The sums over all records
-    // are known now, which gradients need.
+    // Blend the same records again, with the same results. Gradients need the sums over
+    // all records, which are known now.
     const auto slot_of = [&](uint32_t j) {
         const uint32_t slot =
             fit.slot_first(region)[j] + __popcll(fit.mask(region)[j] & ((CellMask(1) << cell) - 1));

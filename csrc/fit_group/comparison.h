@@ -114,7 +114,7 @@ class Comparison {
         error[1] += sum_of(alpha_sum) / num_pixels;
     }
 
-    // Adds the gradient of the D-SSIM part of the loss. Its planes are row major.
+    // Adds the gradient of the D-SSIM part of the loss.
     void add_dssim(const FitView& view, const FitImage& target) {
         const int size = view.size, across = tiles_across(view);
         const size_t n = static_cast<size_t>(size) * size;

@@ -10,16 +10,16 @@ namespace cuda {
 // The key of gaussians that are not drawn. It is larger than all depths.
 constexpr uint32_t kHiddenKey = 0xfffffffeu;
 
-// Computes the rank of gaussian `i` and writes `i` there. `view_keys` are the keys of
-// its view.
+// Computes the rank of gaussian `i` in its view, and writes `i` at that position.
+// `view_keys` are the keys of the view.
 template <class Fit>
 __device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_t begin,
                               uint32_t i) {
     const uint4* all = reinterpret_cast<const uint4*>(view_keys);
     const uint32_t key = view_keys[i], warp_first = i - threadIdx.x % 32;
     uint32_t rank = 0;
-    // Equal keys are ordered by index. So an equal key in an earlier run of 32 precedes
-    // this one, and an equal key in a later run follows it.
+    // Equal keys are ordered by index. So an equal key in an earlier run of 32
+    // gaussians precedes `key`, and an equal key in a later run follows it.
     const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
         for (uint32_t run = from; run < to; run += 32) {
             uint4 other[8];

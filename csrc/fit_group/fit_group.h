@@ -33,15 +33,16 @@ struct FitConfig {
     int num_views;
     int supersample;  // targets are drawn this many times larger, then averaged
     int image_size;   // px; 0: derived from px2_per_gaussian
-    // area of the ball's footprint per gaussian, if image_size is 0
+    // Area of the ball's footprint per gaussian, if image_size is 0.
     float px2_per_gaussian;
     float distance;    // distance of the camera from the centre, in radii
     float filter_px2;  // filter of the fitted gaussians, px²
     bool antialiased;
     LossWeights loss;
-    // The step sizes of Adam. That of positions is in radii or, if `position_in_world`,
-    // in world units. Step sizes decay exponentially, to `final_step` times the initial
-    // value in the last step. `beta2` is Adam's decay of the mean of squared gradients.
+    // The step sizes of Adam. The step size of positions is in radii or, if
+    // `position_in_world`, in world units. Step sizes decay exponentially, to
+    // `final_step` times the initial value in the last step. `beta2` is Adam's decay of
+    // the mean of squared gradients.
     float step_position, step_log_scale, step_quat, step_logit, step_sh0, step_sh_rest;
     bool position_in_world;
     float final_step, beta2;
@@ -101,7 +102,8 @@ V3DG_DECLARE_PER_ISA(void fit_target(const FitConfig& config, const FitGroup& gr
 
 // Fits one group. `rows` has the initial values, and receives the result, in world
 // units, with plain scales and opacities. `targets` has the pictures of the fixed
-// views, then those of the held-out views; it is unused if there are no fixed views.
+// views, then the pictures of the held-out views. It is unused if there are no fixed
+// views.
 //
 // `error` becomes the residual on the held-out views: the mean |difference| of colour
 // and of alpha. The initial values are kept if the result is not better on these views,
@@ -123,10 +125,10 @@ struct FitSignals {
 // A group to fit, and where its pictures, views and residual are.
 struct FitJob {
     FitGroup group;
-    uint64_t first_pixel;  // index of its first pixel in `targets`
-    uint64_t first_view;   // index of its first view in `views`
-    uint32_t error;        // index of its residual in `error`
-    int size;              // side of its pictures, px
+    uint64_t first_pixel;  // index of the job's first pixel in `targets`
+    uint64_t first_view;   // index of the job's first view in `views`
+    uint32_t error;        // index of the job's residual in `error`
+    int size;              // side of the job's pictures, px
 };
 
 // The groups to fit, and their targets. All pointers are to device memory, also those

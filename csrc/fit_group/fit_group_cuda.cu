@@ -106,8 +106,8 @@ __device__ void sum_errors(const Fit& fit, double error[2][2]) {
     }
 }
 
-// Writes the result if it is better than the initial values. `error` has sums over
-// pixels: those of the initial values, and those of the result.
+// Writes the result if its loss is at most the loss of the initial values. `error` has
+// sums over pixels, first of the initial values, then of the result.
 template <class Fit>
 __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
     const FitConfig& config = fit.in.config;
@@ -132,8 +132,8 @@ __device__ void fit_one_group(const Fit& fit) {
     const FitConfig& config = fit.in.config;
     const int views_per_step = config.views_per_step;
     const int64_t num_visits = static_cast<int64_t>(config.steps) * views_per_step;
-    // Visits of steps are numbered from 0. The first visits of held-out views have
-    // negative numbers; the last ones follow the steps.
+    // Visits of steps have the numbers 0 to num_visits - 1. Visits of held-out views
+    // come before and after them.
     const auto views_at = [&](int64_t visit) {
         const int64_t left = visit < 0            ? -visit
                              : visit < num_visits ? views_per_step - visit % views_per_step
@@ -147,7 +147,7 @@ __device__ void fit_one_group(const Fit& fit) {
                                                              : 0;
     };
     const auto set_cameras = [&](FitCameras& cameras, int64_t first) {
-        // threads of the last warp, which is the least busy one
+        // The thread's index in the last warp, which is the least busy one.
         const int b = static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);
         if (b == kViewsAtOnce && first >= 0 && first < num_visits)
             cameras.step = fit.in.steps[first / views_per_step];
@@ -251,7 +251,7 @@ int attribute(cudaDeviceAttr name) {
 template <class Shape, int kBlocks>
 bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream,
          int blocks = kBlocks) {
-    // shared memory per block that the kernel and the driver reserve, bytes
+    // Shared memory per block that the kernel and the driver reserve, bytes.
     const size_t reserved = sizeof(FitShared) + 1024;
     const size_t limit =
         (std::min<size_t>(
@@ -327,7 +327,8 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
                           : run<FitShape<512, false, 32>, 1>(in, most, largest, stream) ||
                                 run<FitShape<256, false, 16>, 1>(in, most, largest, stream);
     if (!runs)
-        throw std::runtime_error("cuda: expected 96 KiB of shared memory in a block, got less");
+        throw std::runtime_error(
+            "cuda: expected 96 KiB of shared memory per block, got less; fit on the CPU");
 }
 
 }  // namespace cuda

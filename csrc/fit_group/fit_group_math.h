@@ -43,8 +43,8 @@ struct FitSize {
 };
 
 V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGroup& group) {
-    // With this focal length, the ball's footprint (select/footprint.h) has
-    // px2_per_gaussian for each gaussian.
+    // `focal` is the focal length at which the ball's footprint (select/footprint.h)
+    // has px2_per_gaussian for each gaussian.
     const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
     const double focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian /
                                  solid_angle_of_ball(x2));
@@ -86,7 +86,7 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
         random_rotation(uniform(turned), uniform(turned + 1), uniform(turned + 2), turn);
         multiply(lattice, turn, rotation);
     } else {
-        // The counters must differ from those that shift the picture.
+        // These counters must differ from the counters that shift the picture.
         const uint64_t base = (uint64_t(1) << 63) + 4 * index;
         random_rotation(uniform(base), uniform(base + 1), uniform(base + 2), rotation);
     }
@@ -111,8 +111,8 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
 }
 
 // Chooses the view of each visit. Fixed views are visited repeatedly. `stride` is
-// coprime to their number, so that all are visited, and consecutive views are far
-// apart. Without fixed views, each visit has its own view.
+// coprime to the number of fixed views, so that all of them are visited, and
+// consecutive views are far apart. Without fixed views, each visit has its own view.
 inline uint64_t visiting_stride(const FitConfig& config) {
     const auto num_views = static_cast<uint64_t>(config.num_views);
     uint64_t stride = 29;
@@ -129,10 +129,10 @@ V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
-// A group is compared with the pictures of its fixed views or, without fixed views,
-// with those of the views of all steps; then with the pictures of the held-out views.
-// The functions return the number of pictures before the held-out ones, the number of
-// all pictures, and the view of a picture.
+// A group is compared with several pictures. First come the pictures of its fixed views
+// or, without fixed views, of the views of all steps. Then come the pictures of the
+// held-out views. The functions return the number of pictures before the held-out ones,
+// the number of all pictures, and the view of a picture.
 V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
                                 : static_cast<uint64_t>(config.steps) * config.views_per_step;
@@ -181,7 +181,7 @@ V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
 }
 
 constexpr float kLeastScale = 1e-5f;  // relative to the radius; far below a pixel
-// keeps the logit finite, and its gradient above 0
+// Keeps the logit finite, and its gradient above 0.
 constexpr float kLeastOpacity = 1e-4f;
 constexpr float kLog2e = 1.4426950408889634f;
 
@@ -206,7 +206,8 @@ V3DG_HD V3DG_INLINE V scale_of_log(V x) {
     return exp2_in_range(min_of(all_lanes<V>(0.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
 }
 // Converts a logit to an opacity, which stays kLeastOpacity away from 0 and 1, because
-// gradients vanish there. This is no restriction: alpha is clamped to 0.999 anyway.
+// gradients vanish there. The limit loses nothing, because alpha is clamped to 0.999
+// anyway.
 template <class V>
 V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
     constexpr float kMost = 13.287568f;  // log2(1 / kLeastOpacity - 1)

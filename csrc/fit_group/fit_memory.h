@@ -1,7 +1,7 @@
 #pragma once
 
-// Where the arrays of a fit are on the device: in the shared memory of a block, or in
-// scratch memory. The host computes this, so the header does not use CUDA.
+// The locations of the arrays of a fit on the device: in the shared memory of a block,
+// or in scratch memory. The host computes them, so this header does not use CUDA.
 
 #include <cstddef>
 #include <cstdint>
@@ -18,7 +18,7 @@ constexpr int kViewsAtOnce = 2;
 constexpr int kCell = 4, kCellPixels = kCell * kCell;
 constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
 static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16,
-              "a mask is a word, a cell half a warp");
+              "a CellMask has 64 bits, and a half-warp has 16 lanes");
 using CellMask = unsigned long long;
 constexpr int kAtOnce = 4;  // gaussians that a half-warp blends together
 constexpr int kSums = 9;    // values per slot: FalloffSums and colour
@@ -31,22 +31,23 @@ template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
 struct FitShape {
     static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;
     static constexpr bool kSmall = kIsSmall;
-    // the index of a gaussian in the current views
+    // The index of a gaussian in the current views.
     using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;
 };
 
-// Where an array is: in the block's shared memory, or in the team's scratch memory.
+// The location of an array: in the block's shared memory, or in the team's scratch
+// memory.
 struct Place {
     size_t offset;
     bool is_shared;
 };
 
 struct FitLayout {
-    // in shared memory for small groups, in scratch memory for large ones
+    // Arrays in shared memory for small groups, and in scratch memory for large groups.
     size_t records, sorted, keys, mask, slot_first, order, lists, errors;
     size_t list_size;          // bytes of a half-warp's list
     size_t fragments, staged;  // in shared memory
-    // in shared memory if there is room, else in scratch memory
+    // Arrays in shared memory if there is room, and otherwise in scratch memory.
     Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
     size_t far_slots, maps, exchange;  // in scratch memory
     uint32_t num_near_slots, num_far_slots;
@@ -75,7 +76,7 @@ struct Arena {
         return scratch - rounded(bytes);
     }
     // Returns memory that is in shared memory for a small group, and in scratch memory
-    // for a large one.
+    // for a large group.
     size_t hot(size_t bytes) { return is_small ? in_shared(bytes) : in_scratch(bytes); }
     // Returns memory that is in shared memory for a small group if there is room, and
     // otherwise in scratch memory.
@@ -123,9 +124,9 @@ FitLayout layout_of(const FitSizes& sizes) {
     const size_t errors_bytes = kViewsAtOnce * (cells + largest) * 2 * kFloat;
     l.errors = kSmall && errors_bytes <= kFragments ? l.fragments : arena.hot(errors_bytes);
     if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
-    // While gradients are written, the fragments are not in use, nor, in small groups,
-    // the lists before them. While keys are sorted, they are not in use yet. So
-    // gradients and keys can share their memory.
+    // Gradients and sort keys share memory with the fragments and, in small groups,
+    // with the lists. The lists and the fragments are never in use together with
+    // gradients or keys.
     const size_t over = kSmall ? l.lists : l.fragments;
     const auto over_fragments = [&](size_t bytes) {
         return num_blocks == 1 && bytes <= l.fragments + kFragments - over ? Place{over, true}
@@ -141,13 +142,13 @@ FitLayout layout_of(const FitSizes& sizes) {
         l.sort_keys = over_fragments(size * sizeof(unsigned long long));
     }
     static_assert(kSumStride * kFloat == sizeof(Record<float>),
-                  "sums take the place of the records");
+                  "sums overwrite the records, so they must have the same size");
     l.sums = {l.records, kSmall};
     l.value = arena.anywhere(values * kFloat);
     l.m = arena.anywhere(values * kFloat);
     l.v = arena.anywhere(values * kFloat);
     l.sum = {arena.in_scratch(values * kFloat), false};
-    // at least enough for the slots of one region
+    // There is room for at least the slots of one region.
     l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
     l.far_slots = arena.in_scratch(l.num_far_slots * kSums * kFloat);
     if (sizes.has_dssim)

@@ -13,8 +13,8 @@ void check_size(const FitConfig& config, const FitGroup& group) {
     if (!(side <= UINT16_MAX))
         throw std::invalid_argument(
             "px2_per_gaussian, distance, supersample: expected pictures of at most " +
-            std::to_string(UINT16_MAX) + " px, got settings that give a group of " +
-            std::to_string(group.count) + " gaussians larger ones");
+            std::to_string(UINT16_MAX) + " px, got larger ones for a group of " +
+            std::to_string(group.count) + " gaussians");
 }
 
 FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index) {

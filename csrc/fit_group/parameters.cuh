@@ -71,8 +71,8 @@ __device__ bool write_parameters(const Fit& fit) {
     return true;
 }
 
-// Adds the gradients of a batch of views to those of the step. After the last batch, it
-// performs the step of Adam.
+// Adds the gradients of a batch of views to the gradients of the step. After the last
+// batch, it performs the step of Adam.
 template <class Fit>
 __device__ void move_parameters(const Fit& fit, const FitStep& step, int num_views, int turn,
                                 bool is_first, bool is_last) {

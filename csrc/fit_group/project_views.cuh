@@ -1,7 +1,7 @@
 #pragma once
 
 // Projects the gaussians of a group into the views of a batch, one thread per gaussian
-// and view. Computes the gradients of parameters from those of records.
+// and view. Computes the gradients of parameters from the gradients of records.
 
 #include <type_traits>
 

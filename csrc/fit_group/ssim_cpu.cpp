@@ -28,7 +28,8 @@ void add(SsimSums<double>& to, double weight, const SsimSums<double>& s) {
 template <class T>
 double sum_of_row(const SsimInput<T>& in, size_t row) {
     const size_t row_size = in.width * in.channels;
-    std::vector<SsimSums<double>> columns(row_size);  // vertical sums: one per column
+    // Sums over the rows of the window, one per column.
+    std::vector<SsimSums<double>> columns(row_size);
     for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
         const size_t first = mirrored(row, k, in.height) * row_size;
         for (size_t i = 0; i < row_size; ++i) {

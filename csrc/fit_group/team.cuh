@@ -26,19 +26,19 @@ struct FitCameras {
 
 constexpr int kBetweenGroups = 2;
 
-// The state that the blocks of a group share, without arrays.
+// The variables that the blocks of a group share. Their arrays are in FitLayout.
 struct FitTeam {
     unsigned arrived;  // number of arrivals at barriers
     unsigned unit, ticket;
-    // The elements before kBetweenGroups are used in turn within steps; the last
-    // element is used between groups.
+    // Copies of FitSignals::cancel. Steps use the first elements in turn, so that one
+    // is read while the next is written. The last element is used between groups.
     int cancel[kBetweenGroups + 1];
     uint32_t num_slots[kLargestTeam];  // number of slots in each block's part
-    // errors of each block's views: initial values, and result
+    // [view][initial values, result][colour, alpha] errors of the block's views.
     double error[kViewsAtOnce][2][2];
 };
 
-// The state of a block in shared memory, without arrays.
+// The variables of a block in shared memory. Its arrays are in FitLayout.
 struct FitShared {
     FitCameras cameras[2];  // for this batch of views, and for the next
     FitTeam own;            // used if the team is a single block
@@ -58,18 +58,18 @@ struct FitBlock : Shape {
     const FitGroupsInput& in;
     const FitLayout& layout;
     FitShared& s;
-    // All blocks of the group. The blocks of a small group divide the views among them.
+    // All blocks of the group. In a small group, the blocks divide the views.
     FitTeam& all;
     // The blocks that process the same views. In a small group, each block is a team.
     FitTeam& team;
     const unsigned team_rank, team_size;
-    // the block's views of a batch: view_rank, view_rank + view_stride, ...
+    // The block's views of a batch: view_rank, view_rank + view_stride, ...
     const unsigned view_rank, view_stride;
     unsigned char* const scratch;
     // The gradients per view, for small groups with several blocks.
     unsigned char* const exchange;
     unsigned char* const hot;
-    // the current group
+    // The current group.
     const FitJob& job;
     uint32_t n = 0, n_padded = 0;
     int num_sh = 0;

@@ -17,16 +17,16 @@ __device__ inline void count_tile(uint32_t* count, uint32_t tile) {
         atomicAdd(count + tile, unsigned(__popc(peers)));
 }
 
-// A queue of tiles to count: those beyond the first tile of each record. A warp counts
-// them when there are 32.
+// A queue of tiles to count. It holds every tile of a record except the first. A warp
+// counts tiles when the queue has 32.
 struct WaitingTiles {
     uint32_t tile[31 + 32 * (kFewTiles - 1)];
     unsigned count;
 };
 
 // Calls add(k, at) for each tile k >= 1 of each lane, where `at` is the tile's index in
-// the queue. Adds the number of these tiles to `num_waiting`. All lanes of the warp
-// must call it.
+// the queue. Adds the number of calls to `num_waiting`. All lanes of the warp must call
+// it.
 template <class Add>
 __device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& add) {
     const unsigned lane = threadIdx.x % 32;

@@ -9,7 +9,7 @@ namespace cuda {
 
 // The result of selecting a cut within a budget of gaussians: the tolerance that was
 // used. If even the coarsest cut exceeds the budget, nothing is selected, and `least`
-// is the number of gaussians of that cut.
+// is the number of gaussians of the coarsest cut.
 struct CutChoice {
     float tolerance_px2;
     bool exceeds_budget;
@@ -20,11 +20,16 @@ struct CutChoice {
 // counted, but not stored; then nothing is drawn.
 struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
-    // large records or parts of them, including padding of batches
+    // Large records or parts of them, including padding of batches.
     unsigned long long large;
     unsigned long long spread;  // number of list entries that need scratch memory
     unsigned long long slots;   // number of gradient slots, in a frame with a tape
     CutChoice choice;           // valid if the cut has a budget
+};
+
+// The counts of one image, for frames that report counts of images.
+struct ImageCounts {
+    unsigned long long gaussians, in_frustum;
 };
 
 // The capacities of a frame's buffers, in elements.
@@ -35,8 +40,8 @@ struct Capacity {
         return items == other.items && records == other.records && large == other.large &&
                entries == other.entries && spread == other.spread;
     }
-    // Returns whether the buffers hold these numbers of items and of gaussians. Like
-    // the next function it has no branches, so that a kernel loads all counters at
+    // Returns whether the buffers hold `num_items` items and `num_gaussians` gaussians.
+    // Like the next function it has no branches, so that a kernel loads all counters at
     // once.
     V3DG_HD bool holds_items(unsigned long long num_items, unsigned long long num_gaussians) const {
         return (num_items <= items) & (num_gaussians <= records);

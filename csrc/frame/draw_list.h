@@ -12,13 +12,13 @@ namespace v3dg {
 
 struct Codes;
 
-// How a gaussian is drawn. Gaussians that are adjacent in memory and have equal
-// appearance are drawn together.
+// The settings with which a gaussian is drawn. Gaussians that are adjacent in memory
+// and have equal settings are drawn together.
 template <class T>
 struct Appearance {
     T filter_px2;      // variance that is added on screen in x and in y
     bool antialiased;  // whether the opacity is reduced to compensate for the filter
-    // whether the filter is limited for very narrow gaussians (project_math.h)
+    // Whether the filter is limited for very narrow gaussians (kMostFilterOfVariance).
     bool is_limited;
 
     V3DG_HD bool operator==(const Appearance& other) const {
@@ -36,7 +36,8 @@ struct Draw {
     Appearance<T> appearance;
     Palette palette{};
     const Codes* codes = nullptr;
-    T weight = 1;  // factor of the opacities: that of the instance times that of a fade
+    // factor of the opacities: the weight of the instance times the weight of a fade
+    T weight = 1;
     // [3] factors of red, green, blue; not applied to palettes; null: none
     const float* color_factors = nullptr;
 };
@@ -69,8 +70,8 @@ struct DrawItem {
     float weight;  // factor of the opacities; below 1 in a fade
 };
 
-// The buffer for a frame's items. The kernel that writes items counts all of them in
-// counters->items, and stores only those that fit. counters->gaussians is the end of
+// The buffer for a frame's items. The kernel that writes items counts all items in
+// counters->items, but stores only as many as fit. counters->gaussians is the end of
 // the last item's records. Items whose records end beyond record_capacity may be left
 // out.
 struct ItemList {

@@ -48,13 +48,35 @@ struct Picture {
     Window window;
     T background[3];
     T* color;  // premultiplied by alpha, plus background
-    T* alpha;
+    T* alpha;  // may be null
     // Expected depth: the sum of weight * depth, divided by alpha; 0 if alpha is 0. May
     // be null.
     T* depth;
     // Number of blended gaussians per pixel, drawn instead of depth. May be null.
     T* count = nullptr;
     float min_transmittance = kStopsBefore;
+    // The distance between adjacent pixels, in floats, in `color` and in `alpha`.
+    int color_step = 3, alpha_step = 1;
+};
+
+// The memory of pictures of one size, one after another. With four channels, the colour
+// contains alpha, and `alpha` is null.
+struct BatchPlanes {
+    float* color;  // (B, H, W, channels)
+    int channels;  // 3 or 4
+    float* alpha;  // (B, H, W), or null
+    float* depth;  // (B, H, W), or null
+
+    // Returns the planes that begin at pixel `pixel`, which is counted over all
+    // pictures.
+    V3DG_HD BatchPlanes from(size_t pixel) const {
+        return {.color = color + channels * pixel,
+                .channels = channels,
+                .alpha = alpha == nullptr ? nullptr : alpha + pixel,
+                .depth = depth == nullptr ? nullptr : depth + pixel};
+    }
+    V3DG_HD float* alpha_plane() const { return channels == 4 ? color + 3 : alpha; }
+    V3DG_HD int alpha_step() const { return channels == 4 ? 4 : 1; }
 };
 
 // The gradients of a Picture, in the same layout. `depth` may be null.
@@ -73,7 +95,9 @@ constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
 // The destination of a picture on CUDA (see Picture<float>). A frame may obtain it
 // after its first stages are enqueued.
 struct PicturePlanes {
-    float *color, *alpha, *depth;  // null: all three, or depth only
+    // May be null: either all three, only alpha, or only depth.
+    float *color, *alpha, *depth;
+    bool has_four_channels;  // alpha is the fourth channel of `color`
 };
 
 // One picture of a batch.
@@ -87,14 +111,12 @@ struct FrameImage {
     PicturePlanes planes;
 };
 
-static_assert(sizeof(FrameImage) <= 128, "a warp loads it at once");
-
 V3DG_HD inline uint32_t num_tiles_of(const FrameImage& image) {
     return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
 }
 
 // The pictures of the one or two eyes of a scene's frame. The tiles of the second
-// picture follow those of the first one.
+// picture follow the tiles of the first picture.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;

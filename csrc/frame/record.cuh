@@ -16,7 +16,7 @@ constexpr int kEllipseVectors = 2;  // vectors per record in RecordPlanes::ellip
 static_assert(sizeof(Record<float>) == kRecordVectors * sizeof(float4) &&
                   offsetof(Record<float>, l22) == 16 && offsetof(Record<float>, color) == 24 &&
                   offsetof(Record<float>, depth) == 36 && offsetof(Record<float>, x0) == 40,
-              "a record lies in its vectors as record_of_vectors() has it");
+              "record_of_vectors() requires this layout of a record");
 
 __device__ inline const float4* ellipse_of(const RecordPlanes& records, uint32_t record) {
     return reinterpret_cast<const float4*>(records.ellipse) + kEllipseVectors * size_t(record);

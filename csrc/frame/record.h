@@ -42,7 +42,7 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
 }
 
 // The sum, over pixels, of the absolute gradient with respect to a gaussian's centre,
-// per axis. Unlike the gradient, it is large even if the pixels' gradients cancel.
+// per axis. The sum is large even where the signed gradients of pixels cancel.
 template <class V>
 struct CenterSize {
     V u, v;

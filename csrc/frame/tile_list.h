@@ -19,8 +19,8 @@ namespace cuda {
 //
 // Frames with more records use up to two bits of the depth for the index. Depths are
 // then rounded, and entries with equal depth are ordered by the exact depths of their
-// records. The exception are tiles in which more than a thousand entries share 26 bits
-// of depth.
+// records. Exceptions are tiles in which more than a thousand entries share 26 bits of
+// depth.
 struct TileEntry {
     unsigned long long key;
 };
@@ -98,7 +98,8 @@ V3DG_HD inline uint32_t key_order(TileEntry e) {
 V3DG_HD inline uint32_t blocks_of(TileEntry e) {
     // The entry stores the first block, and the number of columns and of rows that the
     // box lacks to fill the tile.
-    static_assert(kTileBlockColumns == 8 && kTileBlockRows == 4, "a row of blocks is a byte");
+    static_assert(kTileBlockColumns == 8 && kTileBlockRows == 4,
+                  "each row of blocks must fill one byte of the mask");
     const uint32_t box = static_cast<uint32_t>(e.key), fewer = box >> 5;
     return (0xffu >> (fewer & 7)) * (0x01010101u >> (fewer & 24)) << (box & 31);
 }
@@ -115,11 +116,11 @@ struct TilePlan {
     // concurrently.
     bool in_windows;
     bool in_scratch;  // whether the spread list is in scratch memory, not in place
-    // index of the list in scratch memory, if in_scratch
+    // Index of the list in scratch memory, if in_scratch.
     unsigned long long first_scratch;
 };
 constexpr uint32_t kNoTile = ~0u;
-// number of classes into which plans are sorted by load
+// Number of classes into which plans are sorted by load.
 constexpr int kPlanClasses = 64;
 
 // The pixel box of a Record.
@@ -165,7 +166,7 @@ struct FrameLists {
     uint32_t num_tiles;
     RecordPlanes records;                  // ordered by item and gaussian, with gaps between items
     const unsigned long long* tile_first;  // [num_tiles + 1] first entry of each tile
-    // each tile's entries in any order; and scratch memory
+    // Each tile's entries in any order; and scratch memory.
     TileEntry *entries, *scratch;
     FrameCounters* counters;
     Capacity capacity;  // `records` is at most kMostFrameRecords
@@ -184,13 +185,16 @@ struct FrameLists {
     bool has_depth = true;  // must be true if any image has a depth plane
     // Host memory that receives a copy of the counters; may be null.
     FrameCounters* report = nullptr;
+    // The number of images that become NaN if the counters exceed a capacity. All of
+    // these images have planes. 0 leaves the images unchanged.
+    uint32_t num_marked = 0;
 };
 
 // Records over more tiles than this are large: they are processed by rows of tiles.
 constexpr unsigned kFewTiles = 4;
 
-// The tiles that a record touches: the first tile, and the number of columns and of all
-// tiles.
+// The tiles that a record touches: the first tile, the number of columns, and the
+// number of tiles.
 struct TileBox {
     uint32_t left, top, columns, count;
 
@@ -239,10 +243,10 @@ V3DG_HD inline EntryBox box_of(FewTiles f) {
     return {x0, x0 + (box >> 4 & 31), y0, y0 + (box & 15)};
 }
 
-// A large record: a record over more than kFewTiles tiles, or a part of it with some of
-// its rows of tiles. Large records are stored in batches of kLargeAtOnce. The records
-// of a batch come from one item; the end of a batch may be padding. A batch covers at
-// most kMostLargeTiles tiles, or one row of tiles of each record.
+// A large record: a record over more than kFewTiles tiles, or some rows of tiles of
+// such a record. Large records are stored in batches of kLargeAtOnce. The records of a
+// batch come from one item; the end of a batch may be padding. A batch covers at most
+// kMostLargeTiles tiles, or one row of tiles of each record.
 struct alignas(16) LargeRecord {
     uint32_t record, image;  // `record` is kNoRecord for padding
     RecordBox box;

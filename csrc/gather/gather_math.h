@@ -17,7 +17,7 @@ struct Rotations {
     const double* bands;     // [I * kBandsSize]; empty if the result has SH degree 0
 };
 
-// The same as Rotations, in memory that it owns.
+// Owns the arrays of Rotations.
 struct RotationTables {
     std::vector<double> rotation, bands;
 

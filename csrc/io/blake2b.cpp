@@ -9,8 +9,8 @@ namespace v3dg {
 
 Blake2b::Blake2b() { std::copy(kHashStart, kHashStart + 8, state_); }
 
-// BLAKE2b hashes the last block differently, even if it is full. So a full block is
-// hashed only when more bytes follow.
+// BLAKE2b hashes the last block of a message differently, even if the block is full. So
+// a full block is hashed only when more bytes follow.
 void Blake2b::add(const unsigned char* bytes, size_t size) {
     const auto take = [&](size_t count) {
         if (count > 0) std::memcpy(waiting_ + num_waiting_, bytes, count);

@@ -32,7 +32,7 @@ class Blake2b {
 
   private:
     uint64_t state_[8];
-    uint64_t num_bytes_ = 0;  // hashed bytes, without those that wait in the buffer
+    uint64_t num_bytes_ = 0;  // hashed bytes, without the bytes that wait in the buffer
     unsigned char waiting_[kHashBlockBytes] = {};
     size_t num_waiting_ = 0;
 };

@@ -73,7 +73,7 @@ using Words = Row;
 using Words = uint64_t;
 #endif
 
-// b is added last, because it is computed last.
+// b is added last, because b is computed last
 template <class V>
 V3DG_INLINE void mix(V& a, V& b, V& c, V& d, V x, V y) {
     a = a + x + b;
@@ -99,7 +99,8 @@ V3DG_INLINE void mix_round(V* v, const V* m) {
     mix(v[3], v[4], v[9], v[14], m[s[14]], m[s[15]]);
 }
 
-// Unrolled, so that the order of message words in each round is known at compile time.
+// The rounds are unrolled, so that the order of message words in each round is known at
+// compile time.
 template <class V, size_t... kRounds>
 V3DG_INLINE void mix_rounds(V* v, const V* m, std::index_sequence<kRounds...>) {
     (mix_round<kRounds>(v, m), ...);
@@ -192,8 +193,8 @@ void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* bl
     compress_one(state, block, num_bytes, ~uint64_t{0});
 }
 
-// Returns the digest of a message. Its first `num_bytes` bytes were added to the state;
-// `rest` has the others.
+// Returns the digest of a message. The first `num_bytes` bytes were added to the state
+// before; `rest` has the remaining bytes.
 static PageHash digest_of_rest(uint64_t* state, uint64_t num_bytes, const unsigned char* rest,
                                size_t size) {
     const size_t whole = size > 0 ? (size - 1) / kHashBlockBytes : 0,
@@ -223,15 +224,15 @@ V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
         for (int i = 0; i < 8; ++i) rows[i] = _mm512_loadu_si512(blocks[i] + 64 * half);
         for (int odd = 0; odd < 2; ++odd) {
             __m512i pairs[4];  // per lane: words odd, odd + 2, odd + 4, odd + 6
-            __m512i fours[4];  // per lane: two of these words
+            __m512i fours[4];  // per lane: two of the words in `pairs`
             for (int i = 0; i < 4; ++i)
                 pairs[i] = odd ? _mm512_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm512_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
             for (int i = 0; i < 2; ++i) {
-                // odd + 0 and odd + 4
+                // words odd and odd + 4
                 fours[i] = _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0x88);
                 fours[2 + i] =
-                    // odd + 2 and odd + 6
+                    // words odd + 2 and odd + 6
                     _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0xdd);
             }
             for (int i = 0; i < 2; ++i) {

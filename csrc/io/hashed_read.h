@@ -21,9 +21,10 @@ class HashedRead {
   public:
     static constexpr size_t kLargeBytes = size_t(4) << 20;
 
-    // Reads from `offset` on to message[num_before] and later. The bytes before that
-    // are given, and are hashed, too. The last bytes of the message are the hash of all
-    // preceding bytes. The memory of the message must outlive this object.
+    // Fills the message from message[num_before] on with the bytes of the file that
+    // start at `offset`. The caller has filled the bytes before; they are hashed, too.
+    // The last bytes of the message are the hash of all preceding bytes. The memory of
+    // the message must outlive this object.
     HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
                HashOf hash_of);
     HashedRead(const HashedRead&) = delete;
@@ -51,8 +52,7 @@ class HashedRead {
     Condition has_more_;
     size_t num_read_ V3DG_GUARDED_BY(busy_) = 0;
     bool is_over_ V3DG_GUARDED_BY(busy_) = false;
-    // The last members, because their destructors wait for threads that use the members
-    // above.
+    // The last members. Their destructors wait for threads that use the members above.
     std::shared_future<bool> read_;
     std::shared_future<bool> is_sound_;
 };

@@ -39,7 +39,7 @@ struct PlyPlace {
 
 // The location of a number in a row.
 struct PlyField {
-    // the property of a field that no row has
+    // The property of a field that no row has.
     static constexpr size_t kNone = ~size_t(0);
 
     size_t property;  // index among the properties of the vertex element
@@ -47,10 +47,10 @@ struct PlyField {
     PlyType type;
 };
 
-// How the properties of a vertex make a gaussian, and how the file differs from the
-// files of the 3DGS code. Without scale_2, a gaussian is flat, as in 2DGS. Base colours
-// in red, green and blue replace f_dc. filter_3D is the standard deviation of the
-// filter that widens gaussians in Mip-Splatting.
+// The properties of a vertex that make a gaussian, and the differences from the files
+// of the 3DGS code. Without scale_2, a gaussian is flat, as in 2DGS. Base colours in
+// red, green and blue replace f_dc. filter_3D is the standard deviation of the filter
+// that widens gaussians in Mip-Splatting.
 struct PlyLayout {
     size_t num_sh = 1;  // K in memory; coefficients of higher degrees are not read
     bool is_flat = false;
@@ -79,7 +79,8 @@ struct PlyFile {
 PlyFile open_ply(const char* path);
 
 // Reads gaussians from `first` on, as many as `out` has room for. Returns the place of
-// the next gaussian. `known` is the place of any gaussian; that of `first` is fastest.
+// the next gaussian. `known` is the place of any gaussian; reading is fastest if it is
+// the place of `first`.
 //
 // Quaternions are normalised. Exceptions are quaternions that are zero, not finite, or
 // have length 1 up to rounding, so that a file that was written here is read unchanged.

@@ -52,8 +52,8 @@ size_t num_stored_sh(const PlyElement& vertex) {
                    std::to_string(num_rest));
 }
 
-// Returns the names of the properties with base colours. Empty if the file has SH
-// coefficients, or neither.
+// Returns the names of the properties with base colours. The result is empty if the
+// file has SH coefficients, or no colours at all.
 std::vector<std::string> base_color_names(const Fields& fields) {
     if (fields.has("f_dc_0")) return {};
     for (const std::vector<std::string>& names :
@@ -75,8 +75,8 @@ double color_scale(const std::string& name, PlyType type) {
     }
 }
 
-// Returns the name of the property of each slot. Empty for a slot that the file does
-// not have.
+// Returns the name of the property of each slot. The name is empty for a slot that the
+// file does not have.
 std::vector<std::string> slot_names(const Fields& fields, size_t num_stored, PlyLayout& layout) {
     std::vector<std::string> names = {"x",     "y",       "z",       "rot_0",   "rot_1",  "rot_2",
                                       "rot_3", "scale_0", "scale_1", "scale_2", "opacity"};

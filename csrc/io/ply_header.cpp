@@ -10,7 +10,7 @@ namespace v3dg {
 
 namespace {
 
-// real headers have a few kilobytes
+// Real headers have a few kilobytes.
 constexpr size_t kMaxHeaderBytes = size_t(1) << 20;
 // The largest number of elements. Real files have one or two. Elements before the
 // vertices must be skipped one after another.
@@ -111,7 +111,7 @@ struct HeaderParser {
             return false;
         }
         if (words[0] == "format") {
-            if (has_format) throw PlyError("expected one line 'format', got a second");
+            if (has_format) throw PlyError("expected one line 'format', got a second one");
             header.encoding = parse_format(words);
             has_format = true;
         } else if (words[0] == "element") {

@@ -43,10 +43,10 @@ inline size_t size_of(PlyType type) {
 
 struct PlyProperty {
     std::string name;
-    // type of the number, or of the elements of the list
+    // Type of the number, or of the elements of the list.
     PlyType type = PlyType::float32;
     bool is_list = false;
-    // type of the length of a list; an integer type
+    // Type of the length of a list; an integer type.
     PlyType count_type = PlyType::uint8;
 };
 

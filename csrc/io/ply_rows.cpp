@@ -153,7 +153,8 @@ class ByteReader {
     size_t buffer_size_ = 0;
 };
 
-// Parses one row. Unless `packed` is null, copies the numbers outside of lists there.
+// Parses one row. Unless `packed` is null, the numbers that are not in lists are copied
+// to `packed`.
 void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool is_swapped,
               char* packed) {
     for (const PlyProperty& property : element.properties) {
@@ -162,8 +163,8 @@ void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool 
             const double count = load_scalar(reader.take(count_bytes, element, row),
                                              property.count_type, is_swapped);
             if (count < 0)
-                throw PlyError("expected a length of list " + quoted(property.name) + " in row " +
-                               std::to_string(row) + ", got " +
+                throw PlyError("expected a whole number as length of list " +
+                               quoted(property.name) + " in row " + std::to_string(row) + ", got " +
                                std::to_string(static_cast<int64_t>(count)));
             reader.skip(static_cast<size_t>(count) * size_of(property.type), element, row);
         } else if (packed != nullptr) {

@@ -15,7 +15,7 @@ namespace v3dg {
 PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 PlyPlace read_rows_with_lists(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 
-// Returns the offset of the end of an element with lists that begins at `offset`.
+// Returns the offset of the end of an element that has lists and begins at `offset`.
 // Throws PlyError and std::system_error.
 size_t skip_rows_with_lists(const PlyFile& ply, const PlyElement& element, size_t offset);
 

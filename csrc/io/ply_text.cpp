@@ -112,8 +112,9 @@ class NumberReader {
     void skip_list(const PlyProperty& property) {
         const double count = next();
         if (!(count >= 0) || count != std::floor(count))
-            throw PlyError("vertex " + std::to_string(row_) + ": expected a length of list " +
-                           quoted(property.name) + ", got " + std::to_string(count));
+            throw PlyError("vertex " + std::to_string(row_) +
+                           ": expected a whole number as length of list " + quoted(property.name) +
+                           ", got " + std::to_string(count));
         for (double i = 0; i < count; ++i) next();
     }
     void expect_end() {

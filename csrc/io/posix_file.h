@@ -20,8 +20,8 @@ namespace v3dg {
 class PosixFile {
   public:
     static PosixFile open(const char* path) {
-        // With O_NONBLOCK, opening a pipe does not wait for a writer. Regular files
-        // ignore it.
+        // O_NONBLOCK: opening a pipe does not wait for a writer. Regular files ignore
+        // this flag.
         return PosixFile(::open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK));
     }
     static PosixFile create(const char* path) {
@@ -73,8 +73,8 @@ class PosixFile {
         return done;
     }
 
-    // Asks the system to start reading a part of the file. This is only a hint, and has
-    // no effect on some systems.
+    // Asks the system to start reading a part of the file. Some systems ignore the
+    // request.
     void expect(size_t offset, size_t size) const {
 #ifdef POSIX_FADV_WILLNEED
         static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset),

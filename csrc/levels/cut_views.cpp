@@ -18,7 +18,8 @@ namespace v3dg {
 namespace {
 
 constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of a picture's side, px
-// The px² per gaussian of a cut that is selected at the default tolerance: native size.
+// The px² per gaussian at the native size of a cut. At this size, the default tolerance
+// selects the cut.
 constexpr double kNativePx2 = 2;
 // The range of a picture's side, relative to the native size of its cut.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
@@ -26,10 +27,10 @@ constexpr double kDistance = 2.5;  // distance of the camera from the centre, in
 constexpr double kNear = 0.01;     // near depth, in radii
 constexpr int kMostTries = 16;     // attempts to find a gaussian that is in the picture
 constexpr int kMostTriesOfShare = 64;
-// More random numbers than one view, or one of its shares, uses.
+// An upper bound on the random numbers that one view, or one of its shares, uses.
 constexpr uint64_t kRandomNumbersOfView = 1024;
 constexpr double kMostOfAsset = 0.7;  // largest share of the asset's gaussians in a cut
-// The share of gaussians in CutPictures::ball; others may be far away.
+// The share of gaussians that CutPictures::ball contains. The ball ignores outliers.
 constexpr double kShare = 0.99;
 
 // The random numbers of one view.
@@ -92,8 +93,8 @@ Camera on_screen(const Camera& camera, Random& random) {
     return camera.cropped(-left, -above, width, height);
 }
 
-// Returns a window of the picture around a random gaussian. Gaussians are chosen with a
-// probability in proportion to CutPictures::weight.
+// Returns a window of the picture around a random gaussian. CutPictures::weight holds
+// the prefix sums of the probabilities.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
                  Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
@@ -166,8 +167,9 @@ double share_of_part(const CutPictures& pictures, double part) {
     return pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
 }
 
-// Returns the share of gaussians in cut `cut` of a view. Shares are distributed like
-// those of first cuts, but the picture must be within the range of sizes for the cut.
+// Returns the share of gaussians in cut `cut` of a view. Later cuts have the same
+// distribution of shares as first cuts, limited to shares for which the size of the
+// picture is allowed.
 double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t number,
                     size_t cut) {
     if (cut == 0) return view.share;
@@ -180,9 +182,10 @@ double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t
     return view.share;
 }
 
-// How pictures are compared: the largest side of the window, and the samples per pixel
-// side of the asset's picture. The larger gaussians appear, the smoother a picture is,
-// and the fewer samples it needs. `size` is relative to the asset's native size.
+// The parameters of a comparison: the largest side of the window, and the samples per
+// pixel side of the asset's picture. The larger gaussians appear, the smoother a
+// picture is, and the fewer samples it needs. `size` is relative to the asset's native
+// size.
 struct Comparison {
     double widest_px;
     int samples;
@@ -255,7 +258,8 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
     pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
-    // Weight gaussians by size: the mean of their two larger scales, times the opacity.
+    // Weight gaussians by their size on screen, approximately: the mean of the two
+    // larger scales, times the opacity.
     double sum = 0;
     for (size_t i = 0; i < asset.size; ++i) {
         double scale[3];
@@ -312,8 +316,8 @@ std::vector<SelectRule> cuts_of_view(const CutPictures& pictures, const AssetVie
         SelectRule rule = whole;
         BudgetCut found = cuts[cut];
         // If the camera is inside of a group's ball, the group is refined at any
-        // tolerance. So a budget may be met only by the coarsest cut, with far fewer
-        // gaussians. Then exclude the finest levels instead.
+        // tolerance. Then only the coarsest cut may meet the budget, with far fewer
+        // gaussians than allowed. In this case, exclude the finest levels instead.
         while (std::isinf(found.tolerance_px2) &&
                2 * found.num_gaussians < static_cast<int64_t>(budgets[cut]) &&
                rule.min_level < coarsest) {

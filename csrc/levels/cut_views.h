@@ -16,16 +16,16 @@ namespace v3dg {
 
 double median(std::vector<double> values);
 
-// A ball around the median of the means. It contains a given share of the means; others
-// may be far away.
+// A ball around the median of the means. It contains a given share of the means; the
+// other means may be far away.
 struct Surroundings {
     double center[3], radius;
 };
 Surroundings surroundings_of(Span<const float> means, double share);
 
 // Returns a camera that looks at the centre of the ball from `distance` radii away, in
-// direction `outwards`. `right` is the direction to the right in its picture. Both are
-// unit vectors.
+// direction `outwards`. `right` is the direction to the right in its picture. The two
+// directions are unit vectors.
 Camera camera_at(const Surroundings& ball, double distance, const double outwards[3],
                  const double right[3], const Pinhole<double>& projection);
 

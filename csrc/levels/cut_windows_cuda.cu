@@ -89,7 +89,7 @@ __global__ void __launch_bounds__(kItemThreads)
 }  // namespace
 
 DeviceTable::DeviceTable(const ClusterTable& table, cudaStream_t stream) : table_(table) {
-    // The kernels do not read these.
+    // The kernels do not read these tables.
     table_.top_group = {};
     table_.top_cluster = {};
     table_.pages = {};

@@ -43,7 +43,7 @@ struct WindowTables {
 // pixels per window, four floats each.
 V3DG_HD inline PicturePlanes planes_of_window(float* memory, size_t most_pixels, size_t window) {
     float* color = memory + 4 * most_pixels * window;
-    return {color, color + 3 * most_pixels, nullptr};
+    return {color, color + 3 * most_pixels, nullptr, false};
 }
 
 // Windows on the device, and the items of their clusters. A cluster with n gaussians

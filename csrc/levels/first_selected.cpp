@@ -18,7 +18,7 @@ namespace {
 // Limits of the growth of balls. At the default tolerance of kDefaultPx2, they
 // correspond to 1.5 and 0.19 px² per gaussian.
 constexpr double kLeast = 1.4, kMost = 4, kDefaultPx2 = 3;
-// median px² per gaussian
+// Median px² per gaussian.
 constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2, 3};
 constexpr double kWidestPx = 2048;  // largest width of a picture
 constexpr double kBorderPx = 4;     // border around the ball
@@ -31,10 +31,11 @@ constexpr float kPower = 0.7f;
 constexpr double kAsGood = 1.15;
 // Corrections for groups that are hardly visible. kLikeAll times the mean loss of all
 // groups is added to both losses, so that such a group is treated like the average.
-// kOutOfSight times the mean is added to the loss of the leaves, because errors matter
-// less there.
+// kOutOfSight times the mean is added to the loss of the leaves, because errors of
+// hardly visible groups matter less.
 constexpr double kLikeAll = 0.2, kOutOfSight = 0.05;
-// lower limit of losses, and of footprints in the ball
+// Losses are increased by kNothing, and footprints are at least kNothing, so that
+// ratios are finite.
 constexpr double kNothing = 1e-9;
 constexpr int kSteps = 64;  // number of sizes to try
 
@@ -70,7 +71,7 @@ Camera FirstSelected::camera(size_t picture) const {
     const double flat = std::sqrt(1 - z * z);
     const double outwards[3] = {flat * std::cos(angle), flat * std::sin(angle), z};
     double up[3] = {0, 0, 1}, right[3];
-    cross3(up, outwards, right);  // no camera is straight above
+    cross3(up, outwards, right);  // not parallel: no camera is straight above
     for (double& x : right) x /= flat;
     const double focal = focal_[picture / kSides];
     const double size =

@@ -21,7 +21,7 @@ class FirstSelected {
     static constexpr size_t kSides = 8, kSizes = 4;
     static constexpr int kSamples = 2;  // samples per pixel side of the exact picture
 
-    // `means` are those of the leaves, (N, 3); `balls` are those of the groups.
+    // `means` has the means of the leaves, (N, 3). `balls` has the balls of the groups.
     // `group_offset` has the ranges of the groups' gaussians in level 1.
     FirstSelected(Span<const float> means, Span<const Ball> balls,
                   Span<const int64_t> group_offset);
@@ -38,7 +38,7 @@ class FirstSelected {
 
   private:
     Surroundings around_;
-    // px² per gaussian of each group, at a focal length of 1 px
+    // The px² per gaussian of each group, at a focal length of 1 px.
     std::vector<double> footprint_;
     double focal_[kSizes];                                      // focal length of each size, px
     std::vector<double> of_leaves_[kSizes], of_level_[kSizes];  // losses of each group

@@ -20,7 +20,7 @@ constexpr size_t kTargetBytes = size_t(256) << 20;
 
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress) {
-    // pictures per group
+    // Pictures per group.
     const size_t num_pictures = config.num_views > 0 ? config.num_views + kHeldOutViews : 0;
     std::vector<FitImage> images;
     // Draw the target pictures first, in parallel over (group, view). So all threads

@@ -17,8 +17,8 @@ namespace cuda {
 
 namespace {
 
-// The largest size of the target pictures in memory, bytes. Also limited to a quarter
-// of the free memory.
+// The largest size of the target pictures in memory, bytes. The size is also limited to
+// a quarter of the free memory.
 constexpr size_t kTargetBytes = size_t(1) << 30;
 constexpr std::chrono::microseconds kBetweenLooks{50};
 
@@ -42,7 +42,7 @@ class Signals {
     FitSignals* host_ = nullptr;
 };
 
-// Returns the groups as jobs. Those that take longest come first.
+// Returns the groups as jobs. The jobs that take longest come first.
 std::vector<FitJob> jobs_of(const FitConfig& config, Span<const FitGroup> groups) {
     std::vector<FitJob> jobs(groups.size);
     for (size_t g = 0; g < groups.size; ++g)
@@ -119,7 +119,8 @@ class LevelFit {
             if (progress_.cancel) signals.host().cancel = 1;
             std::this_thread::sleep_for(kBetweenLooks);
         }
-        // If two blocks finish at once, the lower of their counts may be reported last.
+        // When two blocks finish at once, they may report their counts in the wrong
+        // order.
         if (!progress_.cancel) signals.host().groups_done = jobs.size;
         report();
     }

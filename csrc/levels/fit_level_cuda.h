@@ -19,10 +19,10 @@ struct DeviceFitTarget {
 // Like v3dg::fit_level(), with rows on the device and `error` in host memory. Returns
 // when the fit is finished.
 //
-// Every run gives the same bits. The number of groups and the device determine how many
-// blocks fit a group, but not the order of additions. Still, kernels may be compiled
-// with different rounding. Target pictures are drawn before the fit, for as many groups
-// at once as memory allows.
+// Every run on a device gives the same bits. The number of groups and the device
+// determine how many blocks fit a group, but not the order of additions. The kernels
+// that different devices use may still round differently. Target pictures are drawn
+// before the fit, for as many groups at once as memory allows.
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress, Stream stream);
 

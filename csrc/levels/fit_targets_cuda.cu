@@ -11,7 +11,7 @@ namespace cuda {
 
 namespace {
 
-// The limits of one frame, unless a single picture exceeds them.
+// The limits on pixels and gaussians in one frame. A single picture may exceed them.
 constexpr uint64_t kPixelsAtOnce = uint64_t(1) << 24, kGaussiansAtOnce = uint64_t(1) << 22;
 constexpr unsigned kThreads = 128;
 

@@ -14,9 +14,10 @@ struct CutRows {
     Span<const float> radius;  // largest scale of each gaussian
 };
 
-// How a refinement compares pictures.
+// The settings of the comparison of pictures in a refinement.
 struct CutComparison {
-    // windows whose gradients are added up for one step; 1 to kMostWindows
+    // The number of windows whose gradients are added up for one step: 1 to
+    // kMostWindows.
     int windows_per_step;
     int cuts_per_view;  // cuts that are compared with each picture of the target
 };
@@ -33,8 +34,8 @@ constexpr int kMostWindows = 32;
 //
 // All levels are drawn with the filter of `config`. This includes level 0, although it
 // is drawn without a filter elsewhere; in small pictures, aliasing is a third of the
-// error of cuts. Pictures of the target are drawn larger and averaged. The loss is that
-// of a fit without D-SSIM. Steps of positions are relative to the radius. The step
+// error of cuts. Pictures of the target are drawn larger and averaged. The loss is the
+// loss of a fit without D-SSIM. Steps of positions are relative to the radius. The step
 // sizes in `config` are for a gaussian that one window shows. The image sizes,
 // supersampling and numbers of views in `config` are ignored.
 //
@@ -44,11 +45,11 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison, const
                  uint64_t target_count, const CutRows& levels, const CutPictures& pictures,
                  FitProgress& progress);
 
-// How much windows show of each gaussian.
+// The visibility of each gaussian in windows.
 struct SeenOfGaussians {
-    // sum of blend weights, as a fraction of each picture's pixels
+    // Sum of blend weights, as a fraction of each picture's pixels.
     Span<double> weight;
-    // number of windows whose cuts contain the gaussian, visible or not
+    // Number of windows whose cuts contain the gaussian, visible or not.
     Span<int32_t> num_looks;
 };
 

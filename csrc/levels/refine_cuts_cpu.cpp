@@ -18,7 +18,8 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kGaussiansAtOnce = 256, kWindowsAtOnce = 32;
-static_assert(kWindowsAtOnce <= kViewSlots, "windows that are made together have own slots");
+static_assert(kWindowsAtOnce <= kViewSlots,
+              "windows that are planned together must use different slots");
 
 // The memory of one picture: colour and alpha.
 class Canvas {
@@ -125,7 +126,8 @@ class Targets {
     Targets(const FitTarget& target, uint64_t count)
         : target_(target), count_(count), pictures_(kViewSlots) {}
 
-    // Returns the picture for a window. It is drawn if the window's view is new.
+    // Returns the picture of the asset for a window. If the window's view is new, the
+    // picture is drawn first.
     const Canvas& picture_of(const CutWindow& window) {
         Canvas& picture = pictures_[window.plan.slot];
         if (!window.plan.is_new) return picture;
@@ -213,7 +215,7 @@ class CutFrame {
         rows_ = rows_in(values_.data(), count, sh_degree);
         return rows_;
     }
-    // Draws the picture. Before backward(), the caller must replace it by its
+    // Draws the picture. Before backward(), the caller must replace the picture by its
     // gradients.
     Canvas& draw(const Camera& camera) {
         model_.emplace(rows_);

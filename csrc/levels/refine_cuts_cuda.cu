@@ -26,12 +26,14 @@ namespace {
 // The number of steps that each thread plans ahead.
 constexpr unsigned kStepsAhead = 3;
 // A slot's target may be overwritten while the preceding steps are drawn.
-static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows, "no step that is drawn reads it");
+static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows,
+              "no step that is being drawn may read it");
 constexpr unsigned kMostPlanners = 4;
 
-// Returns the number of threads that plan steps. It must satisfy two conditions. All
-// windows of a slot belong to one thread, which owns the memory of the slot's target.
-// And no step that is being drawn reads a target that is being overwritten.
+// Returns the number of threads that plan steps. The number must satisfy two
+// conditions. All windows of a slot belong to one thread, which owns the memory of the
+// slot's target. And a target is not overwritten while a step that is being drawn reads
+// it.
 constexpr unsigned num_planners(unsigned windows_per_step) {
     unsigned num = kMostPlanners;
     while (num > 1 && (kViewSlots % (num * windows_per_step) != 0 ||
@@ -40,7 +42,7 @@ constexpr unsigned num_planners(unsigned windows_per_step) {
     return num;
 }
 
-// pixels of the largest window
+// Pixels of the largest window.
 constexpr size_t kMostPixels = kWidestWindowPx * kWidestWindowPx;
 
 FrameImage image_of(const Camera& camera, const PicturePlanes& planes) {
@@ -235,9 +237,9 @@ class TargetPainter {
     Frame frame_;
 };
 
-// Plans the windows of steps ahead of time, in other threads. A step waits for the
-// device only once, and choosing the tolerances of a step takes as long as the step on
-// the device.
+// Plans the windows of steps ahead of time, in other threads, because choosing the
+// tolerances of a step takes as long as the step on the device. A step waits for the
+// device only once.
 class StepsAhead {
   public:
     // If `target` is null, each window has its own view, and no target picture.
@@ -259,7 +261,7 @@ class StepsAhead {
           steps_(kStepsAhead * num_threads_),
           ahead_(num_steps(), num_threads_, kStepsAhead * num_threads_,
                  [this](uint64_t number) { make(number); }) {}
-    // Wait: steps on the device read the members.
+    // Wait for the stream, because steps on the device read the members.
     ~StepsAhead() { cudaStreamSynchronize(stream_); }
 
     uint64_t num_steps() const {
@@ -342,7 +344,7 @@ class StepsAhead {
     std::vector<Worker> workers_;
     std::vector<View> views_;
     std::vector<PlannedStep> steps_;
-    Ahead ahead_;  // The last member, because its threads use all others.
+    Ahead ahead_;  // The last member, because its threads use all other members.
 };
 
 // Computes the gradients of the loss with respect to the pixels of a step's windows.

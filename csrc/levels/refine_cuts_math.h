@@ -71,8 +71,8 @@ V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
 }
 
 // Returns the step sizes for a gaussian that `num_windows` of the step's windows show.
-// The relative noise of a sum of n gradients falls with sqrt(n), so the step grows with
-// it.
+// The relative noise of a sum of n gradients falls with sqrt(n), so step sizes grow
+// with sqrt(n).
 V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
     const float factor = ::sqrtf(static_cast<float>(num_windows));
     for (float* size :
@@ -106,7 +106,7 @@ V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
                                   const FitStep& step, float beta2, const Moments& moments) {
     size_t moment = i;
     const auto moved = [&](float value, float slope, float size) {
-        // a NaN or infinity would stay in the moments
+        // A NaN or infinity would stay in the moments.
         if (!(::fabsf(slope) <= FLT_MAX)) slope = 0;
         const float next = adam_step(value, slope, moments.m[moment], moments.v[moment], size,
                                      beta2, step.correction1, step.correction2);
@@ -152,8 +152,8 @@ V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t
     for (size_t k = 0; k < 3; ++k) rows.sh[3 * to + k] = 0;
 }
 
-// Returns the fraction of a picture that a gaussian covers. `gradient` is that of the
-// picture's sum with respect to the colour of a gaussian from copy_in_grey().
+// Returns the fraction of a picture that a gaussian covers. `gradient` is the gradient
+// of the picture's sum with respect to the colour of a gaussian from copy_in_grey().
 V3DG_HD inline double blend_weight(float gradient, size_t num_pixels) {
     return static_cast<double>(gradient) / (kShBase0 * static_cast<double>(num_pixels));
 }

@@ -109,7 +109,7 @@ __global__ void __launch_bounds__(kThreads)
     put_sum_slopes(out.color + 3 * p.pixel, out.alpha[p.pixel]);
 }
 
-// Where the gradients of a cluster's gaussians are, in each window of a step.
+// The locations of the gradients of a cluster's gaussians, in each window of a step.
 struct ShownCluster {
     const int32_t* item_of_cluster;
     const uint32_t* num_items;
@@ -129,8 +129,9 @@ struct ShownCluster {
     }
 };
 
-// Moves the gaussians of the clusters from `first_cluster` on. Their gradients are
-// summed over the windows; the sum overwrites the first of them.
+// Moves the gaussians of the clusters from `first_cluster` on. The gradients of a
+// gaussian are summed over the windows; the sum overwrites the gradient of the first
+// window.
 __global__ void __launch_bounds__(kItemSize)
     move_kernel(ShownCluster shown, Span<const int64_t> offset, size_t first_cluster,
                 GaussianRows<float> rows, GaussianRows<float> gradient, const float* radius,
@@ -152,7 +153,7 @@ __global__ void __launch_bounds__(kItemSize)
 }
 
 // Adds how much windows show of each gaussian, and counts the windows whose cuts
-// contain it.
+// contain the gaussian.
 __global__ void __launch_bounds__(kItemSize)
     weight_kernel(ShownCluster shown, const WindowTables* windows, Span<const int64_t> offset,
                   GaussianRows<const float> gradient, double* weight, int32_t* num_looks) {

@@ -17,8 +17,8 @@ struct Ellipse {
     V depth;
 };
 
-// A box of pixels: the first and the last column, and the first and the last row. It is
-// empty if a first one is after the last one.
+// A box of pixels: first and last column, first and last row. The box is empty if the
+// first column or row is after the last.
 template <class I>
 struct PixelBox {
     I x0, x1, y0, y1;

@@ -12,8 +12,8 @@
 namespace v3dg {
 
 constexpr double kMinAlpha = 1.0 / 255;  // smaller alphas are not blended
-constexpr double kMaxAlpha = 0.999;      // alpha is clamped to this
-// with gsplat's stop rule, a pixel stops before it is this dark
+constexpr double kMaxAlpha = 0.999;      // larger alphas are clamped to this value
+// gsplat's stop rule keeps the transmittance of a pixel above this value.
 constexpr double kMinTransmittance = 1e-4;
 constexpr double kLog2MinAlpha = -7.994353436858858;
 // At this distance, in standard deviations, the alpha of an opaque gaussian is 1/255.
@@ -106,9 +106,9 @@ struct PackedPlanes {
     Palette palette;
 };
 
-// Returns an upper bound on the reach of a gaussian, in standard deviations, which is
-// not below that of extent_of(). It is negative if the gaussian is too faint to be
-// drawn, and NaN if the opacity is invalid.
+// Returns an upper bound on the reach of a gaussian, in standard deviations. The bound
+// is at least the reach of extent_of(). It is negative if the gaussian is too faint to
+// be drawn, and NaN if the opacity is invalid.
 V3DG_HD inline float reach_in_sigmas(float opacity) {
     if (opacity < float(kMinAlpha)) return -1.0f;
     const float sigmas =
@@ -166,8 +166,8 @@ V3DG_HD inline double inverse_of(double b) {
 #endif
 }
 // Returns a / b; `inverse` is inverse_of(b). Precondition: the numbers are far from the
-// limits of doubles, as are all numbers that result from float32. The result equals
-// that of a device's division, which also handles other numbers.
+// limits of doubles, as are all numbers that result from float32. The result equals the
+// result of a device's division, which also handles other numbers.
 V3DG_HD inline double quotient_of(double a, double b, double inverse) {
 #ifdef __CUDA_ARCH__
     const double q = __dmul_rn(a, inverse);
@@ -226,9 +226,9 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     }
     for (int k = 0; k < 3; ++k)
         for (int i = 0; i < 3; ++i) column[k][i] = product_of(column[k][i], scale[k]);
-    // Rotate columns 1 and 2 by a Givens rotation, so that column 2 begins with 0. This
-    // does not change F Fᵀ. These columns are the shortest, so the rounding errors are
-    // smallest.
+    // Rotate columns 1 and 2 by a Givens rotation, so that column 2 begins with 0. The
+    // rotation does not change F Fᵀ. Columns 1 and 2 are the shortest, so the rounding
+    // errors are smallest.
     const double a0 = column[1][0], b0 = column[2][0],
                  length = sqrt_of(::fma(a0, a0, product_of(b0, b0)));
     const double inverse = inverse_of(length);

@@ -30,7 +30,7 @@ V3DG_HD V3DG_INLINE bool is_any(Mask holds) {
 #endif
 }
 
-// Returns a / b. Precondition: neither is tiny or huge.
+// Returns a / b. Precondition: a and b are neither tiny nor huge.
 template <class V>
 V3DG_HD V3DG_INLINE V quotient_of(V a, V b) {
 #ifdef __CUDA_ARCH__

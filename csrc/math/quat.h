@@ -9,8 +9,8 @@ namespace v3dg {
 
 // The range of squared lengths that are computed without underflow or overflow. For
 // other quaternions, down to the smallest denormal numbers, multiplying by `up` or
-// `down` brings the length into the range. These are powers of two, so nothing is
-// rounded.
+// `down` brings the length into the range. `up` and `down` are powers of two, so
+// nothing is rounded.
 template <class T>
 struct QuatRange {
     static constexpr T least2 = T(0x1p-80), most2 = T(0x1p100), up = T(0x1p100), down = T(0x1p-100);
@@ -25,7 +25,7 @@ V3DG_HD V3DG_INLINE V length2_of_quat(const V q[4]) {
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
 }
 
-// Returns whether a squared length is out of range. False for NaN.
+// Returns whether a squared length is out of range. Returns false for NaN.
 template <class V>
 V3DG_HD V3DG_INLINE auto is_out_of_range(V length2) {
     using Range = QuatRange<Lane<V>>;
@@ -79,7 +79,7 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
 
 // Computes the row-major rotation matrix of a quaternion of any length. Lengths out of
 // range are rare; such lanes are computed a second time. The other lanes keep their
-// first result, so that its rounding does not depend on their neighbours.
+// first result, so that the rounding of a lane does not depend on other lanes.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     const V n2 = length2_of_quat(q);

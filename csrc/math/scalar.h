@@ -11,8 +11,8 @@
 
 namespace v3dg {
 
-// Variables, because nvcc does not allow calls of the host's constexpr functions in
-// device code.
+// The two values are variables, because nvcc does not allow calls of the host's
+// constexpr functions in device code.
 template <class T>
 constexpr T kLargest = std::numeric_limits<T>::max();
 template <class T>
@@ -77,7 +77,7 @@ V3DG_HD inline uint32_t shifted_by_eighths(uint32_t bits, float x) {
     uint32_t last_bits;
     std::memcpy(&last_bits, &number, sizeof last_bits);
 #ifdef __CUDA_ARCH__
-    // uses the last five bits of the shift
+    // The instruction uses the last five bits of the shift.
     return __funnelshift_l(0u, bits, last_bits);
 #else
     return bits << (last_bits & 31);

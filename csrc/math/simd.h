@@ -37,7 +37,7 @@ template <class T>
 constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
 
 typedef int32_t IntVec32 __attribute__((vector_size(kVectorBytes)));
-// unsigned: its arithmetic may wrap
+// The elements are unsigned, because integer arithmetic on this type may wrap.
 typedef uint32_t BitsVec32 __attribute__((vector_size(kVectorBytes)));
 
 template <>
@@ -102,11 +102,11 @@ V3DG_INLINE unsigned sign_bits_of(V x) {
     return bits_of((Mask)x >> (8 * sizeof(x[0]) - 1));
 }
 
-// Returns 2^x for x in [-126, 127], with a relative error below 2^-22. Undefined for
-// other x. The integer part of x becomes the exponent. A minimax polynomial on [-1/2,
-// 1/2] computes the rest.
+// Returns 2^x for x in [-126, 127], with a relative error below 2^-22. The result is
+// undefined for other x. The integer part of x becomes the exponent. A minimax
+// polynomial on [-1/2, 1/2] computes the rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
-    // 1.5 * 2^23: adding it rounds to an integer.
+    // Adding 1.5 * 2^23 rounds to an integer.
     const Vec<float> magic = Vec<float>{} + 12582912.0f;
     const Vec<float> shifted = x + magic;
     const Vec<float> f = x - (shifted - magic);

@@ -23,7 +23,7 @@ struct CameraPose {
 template <class T>
 struct ModelView {
     T linear[9];            // row major
-    T translation[3];       // the rest of the eye after rounding to 24 bits, in view space
+    T translation[3];       // correction for the rounding of `eye`, in view space
     T eye[3], eye_rest[3];  // eye + eye_rest: position of the camera in model space
 };
 
@@ -37,8 +37,8 @@ V3DG_HD inline double leading_bits(double x) {
     return x;
 }
 
-// Sets the eye and the translation of a view. `translation` is that of linear * point +
-// translation.
+// Sets the eye and the translation of a view. `translation` is the translation t of the
+// transform linear * point + t.
 template <class T>
 V3DG_HD inline void set_eye(const double linear[9], const double translation[3],
                             const double eye[3], ModelView<T>& view) {

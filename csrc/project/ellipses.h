@@ -1,7 +1,7 @@
 #pragma once
 
-// The 2D ellipses of all gaussians, including those that are not drawn. Training uses
-// them to decide where to add and to remove gaussians.
+// The 2D ellipses of all gaussians, including gaussians that are not drawn. Training
+// uses the ellipses to decide where to add and to remove gaussians.
 
 #include <cstdint>
 

@@ -34,7 +34,7 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters,
     if (num_batches == 0) return;
     const unsigned count = num_batches * kLargeAtOnce;
     for (unsigned first = 0; first < count; first += 32) {
-        static_assert(kLargeAtOnce == 16, "half a warp has a batch");
+        static_assert(kLargeAtOnce == 16, "a half-warp processes one batch");
         const unsigned k = first + lane;
         LargeRecord large{.record = kNoRecord, .image = space.tables.placement.image, .box = {}};
         int tiles = 0;

@@ -15,13 +15,13 @@
 
 namespace v3dg {
 
-// What a run of gaussians covers in the whole image, not only in the window that is
+// The coverage of a run of gaussians in the whole image, not only in the window that is
 // drawn.
 struct Reach {
     uint64_t in_frustum = 0;  // number of gaussians whose extent meets the image
     uint64_t drawn = 0;       // number of gaussians that reach a pixel centre
     uint64_t entries = 0;     // number of (gaussian, tile) pairs of the drawn gaussians
-    // the pixel rows that the drawn gaussians cover
+    // The pixel rows that the drawn gaussians cover.
     int top = INT_MAX, bottom = INT_MIN;
 };
 

@@ -19,7 +19,7 @@ void place_slots(const ItemList& items, const uint32_t* item_records, const Reco
 
 struct ProjectBackwardInput {
     // Item i consists of the kItemSize gaussians from i * kItemSize on; the last item
-    // may be shorter. Its records begin at i * kItemSize, in the order of the
+    // may be shorter. The records of item i begin at i * kItemSize, in the order of the
     // gaussians.
     const uint32_t* item_records;  // number of records of each item
     RecordPlanes records;

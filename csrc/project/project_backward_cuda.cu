@@ -16,12 +16,12 @@ namespace {
 constexpr int kThreads = kItemSize;
 // One thread sums up to this many slots of a record; a warp sums more.
 constexpr uint32_t kFewSlots = 16;
-// SH words that a thread loads before it stores the first one
+// SH words that a thread loads before it stores any of them
 constexpr int kWordsAtOnce = 6;
 
 template <class Value>
 __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
-    static_assert(sizeof sum % sizeof(float2) == 0, "loaded as pairs");
+    static_assert(sizeof sum % sizeof(float2) == 0, "values are loaded as pairs of floats");
     Value slot;
     for (size_t k = 0; k < sizeof sum / sizeof(float2); ++k)
         reinterpret_cast<float2*>(&slot)[k] = reinterpret_cast<const float2*>(of_slot + i)[k];
@@ -114,7 +114,7 @@ struct ShRow {
     static constexpr int kStride = kWords | 1;
 };
 
-// The gaussians that a block processes: those of an item.
+// The rows of the gaussians that a block processes.
 struct BlockRows {
     uint64_t first;  // row of the first gaussian
     int count;

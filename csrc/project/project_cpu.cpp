@@ -92,8 +92,7 @@ static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsign
     }
 }
 
-// Writes the records of those gaussians `at`, `at` + 1, ... whose bits are set in
-// `lanes`.
+// Writes the records of the gaussians `at` + k for which bit k of `lanes` is set.
 template <class Source, class T, class V, class I>
 static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, uint64_t at,
                                       uint64_t count, unsigned lanes, const Gaussian3d<V>& g,
@@ -158,8 +157,8 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         reach.drawn += __builtin_popcount(drawn_bits);
         top = min_of(top, drawn ? box.y0 : top);
         bottom = max_of(bottom, drawn ? box.y1 : bottom);
-        // Masked before the multiplication: the boxes of gaussians that are not drawn
-        // can be so large that the product overflows.
+        // The mask is applied before the multiplication, because the boxes of gaussians
+        // that are not drawn can be so large that the product overflows.
         const I columns = drawn ? tiles_of(box.x0, box.x1) : I{},
                 rows = drawn ? tiles_of(box.y0, box.y1) : I{};
         entries += columns * rows;
@@ -222,8 +221,8 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrins
     });
 }
 
-// The gaussians of adjacent records are scattered in memory, so the lanes are filled
-// one by one. This costs little compared to the arithmetic.
+// Fill the lanes one by one, because the gaussians of adjacent records are scattered in
+// memory. Filling costs little compared to the arithmetic.
 template <class T, ProjectingModel C>
 static void project_backward_by(const C& camera, const Draw<T>& draw, const uint32_t* source,
                                 const RecordGradient<T>* d_records, size_t count,

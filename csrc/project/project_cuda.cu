@@ -37,8 +37,8 @@ constexpr unsigned kManySmall = 4;
 constexpr unsigned kNearlyAll = 22, kMany = 12;
 
 // Projects the item whose tables the warp has loaded, and returns its number of
-// records. `factors` are those of the item's placement or, in a shared item, of all its
-// placements. `factors` is null if the source has no factors.
+// records. `factors` points to the factors of the item's placement or, in a shared
+// item, of all its placements. It is null if the source has no factors.
 template <class Source, bool kIsShared, class C>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
                                  const InstanceFactors* factors, FrameCounters& counters,
@@ -133,10 +133,25 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
                             .columns = static_cast<uint32_t>(tables.image.tile_columns)};
 }
 
+// Adds the counts of an item to the counts of its image. `num_in_frustum` is the number
+// of this lane. All lanes of the warp must call it.
+template <class Model>
+__device__ void report_image(const ItemTables<Model>& tables, unsigned num_in_frustum,
+                             ImageCounts* image_counts) {
+    num_in_frustum = warp_sum(num_in_frustum);
+    if (threadIdx.x % 32 != 0) return;
+    const unsigned num_instances = max(__popc(tables.item.sharers), 1);
+    ImageCounts& counts = image_counts[tables.placement.image];
+    atomicAdd(&counts.gaussians,
+              static_cast<unsigned long long>(num_instances * tables.item.count));
+    if (num_in_frustum > 0)
+        atomicAdd(&counts.in_frustum, static_cast<unsigned long long>(num_in_frustum));
+}
+
 __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum,
                               unsigned num_records) {
     num_in_frustum = warp_sum(num_in_frustum);
-    // A record is always in the frustum, so without in_frustum there are no records.
+    // Without gaussians in the frustum there are no records.
     if (threadIdx.x % 32 != 0 || num_in_frustum == 0) return;
     atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
     atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
@@ -176,11 +191,14 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         __syncwarp();
         store_tables(space.tables, item_word, placement_word, in, models, loaded);
         if (space.tables.item.sharers == 0 && Source::has(space.tables.model)) {
+            const unsigned before = num_in_frustum;
             const unsigned written = project_item<Source, false, C>(
                 space, nullptr, factors_for<Source>(in, space.tables.item), *in.items.counters, out,
                 num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
+            if (in.image_counts != nullptr)
+                report_image(space.tables, num_in_frustum - before, in.image_counts);
         }
         i = __shfl_sync(kAllLanes, next, 0);
     }
@@ -218,11 +236,14 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
             store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]),
                          in, models, loaded);
             if (!Source::has(space.tables.model)) continue;
+            const unsigned before = num_in_frustum;
             const unsigned written =
                 project_item<Source, true, C>(space, sharers, factors_for<Source>(in, item),
                                               *in.items.counters, out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
+            if (in.image_counts != nullptr)
+                report_image(space.tables, num_in_frustum - before, in.image_counts);
         }
     }
     count_waiting(out.tiles.count, space.tiles);
@@ -231,8 +252,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 
 }  // namespace
 
-// `SharedSource` reads the models of shared items. It never fades, because shared items
-// have weight 1.
+// Launches the kernels for one source. `SharedSource` reads the models of shared items;
+// it has no fades, because shared items have weight 1.
 template <class Source, class SharedSource, class C = Pinhole<float>>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, int taken, cudaStream_t stream) {

@@ -36,6 +36,8 @@ struct ProjectInput {
     // the factors at index p modulo num_factors.
     const InstanceFactors* factors;
     uint32_t num_factors;
+    // [images] counts to which the kernel adds; null if not requested
+    ImageCounts* image_counts;
 
     // Returns the factors of an item's first placement. In a shared item, the factors
     // of the next placements follow. Precondition: `factors` is not null.
@@ -46,7 +48,7 @@ struct ProjectInput {
 
 struct ProjectOutput {
     RecordPlanes records;
-    FewTiles* few;           // small records' tiles, one element per record (see TileBinInput)
+    FewTiles* few;           // tiles of each small record (see TileBinInput)
     uint32_t* item_records;  // [items] number of records of each item
     ItemTiles* item_tiles;   // [items] the tiles of each item
     // The index of each record's gaussian in its model. Null if records.box is null.

@@ -180,7 +180,8 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
                                                        T filter_px2, bool antialiased,
                                                        const Projection<V, C>& s,
                                                        const Ellipse<V>& e, const Ellipse<V>& d) {
-    // From the ellipse to the covariance. c11 affects the ellipse only through det.
+    // Propagate from the ellipse to the covariance. c11 affects the ellipse only
+    // through det.
     const V d_l11 = d.l11 - d.l12 * (s.c12 / s.c22);
     const V half = 1 / (2 * s.c22);
     const V d_c22 = (d_l11 * e.l11 - d.l22 * e.l22) * half - d.l12 * e.l12 / s.c22;
@@ -188,7 +189,7 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
     V d_det = -d_l11 * e.l11 / (2 * s.det);
     V d_det0 = V{};
     Gaussian3d<V> out;
-    // log2_opacity = log2(opacity) + log2(det0 / det) / 2; the last term if
+    // log2_opacity = log2(opacity) + log2(det0 / det) / 2. The last term exists only if
     // antialiased.
     out.opacity = d.log2_opacity / (T(kLn2) * g.opacity);
     if (antialiased) {

@@ -62,7 +62,7 @@ __device__ void color_of_row(const float* row, const float mean[3], const ModelV
     color_of<kDegree>(coefficient, mean, view, color);
 }
 
-// The base of sources that have a row for each gaussian.
+// The base class of sources that have a row for each gaussian.
 template <class RowModel>
 struct OfRows {
     using Model = RowModel;
@@ -168,10 +168,10 @@ struct CodeSource {
     static constexpr bool kFades = false;
     static constexpr bool kTints = false;
     struct Place {
-        // cluster of the current row, and the end of that cluster's rows
+        // Cluster of the current row, and the end of that cluster's rows.
         uint32_t cluster, end;
     };
-    // Values that depend only on the code of the opacity. A table holds them.
+    // The values that depend only on the code of the opacity, for a table.
     struct OpacityEntry {
         float reach_in_sigmas, log2_opacity;
     };

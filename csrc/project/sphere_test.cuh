@@ -49,8 +49,8 @@ __device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float
     const float reach = e.log2_opacity - static_cast<float>(kLog2MinAlpha) + 1e-4f;
     const auto misses = [&](int row) {
         const float dy = static_cast<float>(row) + 0.5f - e.v;
-        // In this row, alpha has its maximum at `middle`. Rounding gives the pixel
-        // centre that is nearest to it, even if that is outside of the image.
+        // In this row of pixels, alpha is largest at x = `middle`. Rounding gives the
+        // nearest pixel centre, which may be outside of the image.
         const float middle = slope * dy + u;
         const float t1 = e.l11 * fmaxf(fabsf(middle - round_of(middle)) - margin, 0.0f),
                     t2 = e.l22 * dy;

@@ -12,7 +12,7 @@ namespace cuda {
 
 constexpr unsigned kWarps = 8;
 constexpr unsigned kQueue = 64;  // up to 31 gaussians remain queued when 32 are added
-// up to 31 large records remain queued when 32 are added
+// Up to 31 large records remain queued when 32 are added.
 constexpr unsigned kMostWaiting = 64;
 
 // A gaussian in the queue of a warp.
@@ -40,7 +40,8 @@ struct WarpSpace {
 // Copies a table to shared memory with a warp: lane i copies the i-th 32-bit word.
 template <class T>
 __device__ uint32_t load_word(const T& from) {
-    static_assert(sizeof(T) <= 32 * sizeof(uint32_t), "a warp copies a table");
+    static_assert(sizeof(T) <= 32 * sizeof(uint32_t),
+                  "each lane copies at most one 32-bit word of a table");
     const unsigned lane = threadIdx.x % 32;
     return lane < sizeof(T) / sizeof(uint32_t)
                ? __ldg(reinterpret_cast<const uint32_t*>(&from) + lane)
@@ -52,6 +53,13 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
+// Copies a table of any size with a warp.
+template <class T>
+__device__ void copy_table(T& to, const T& from) {
+    for (unsigned k = threadIdx.x % 32; k < sizeof(T) / sizeof(uint32_t); k += 32)
+        reinterpret_cast<uint32_t*>(&to)[k] = __ldg(reinterpret_cast<const uint32_t*>(&from) + k);
+}
+
 // The image and the model whose tables are in the warp's shared memory.
 struct Loaded {
     uint32_t image = ~0u, model = ~0u;
@@ -59,7 +67,7 @@ struct Loaded {
 
 // Stores the tables of an item in shared memory. Lane i passes the i-th 32-bit word of
 // the item and of the placement. The image and the model are loaded only if they differ
-// from those of the last item.
+// from the image and the model of the previous item.
 template <class Model>
 __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint32_t placement_word,
                              const ProjectInput& in, const Model* models, Loaded& loaded) {
@@ -68,7 +76,7 @@ __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint
     __syncwarp();
     if (tables.placement.image != loaded.image) {
         loaded.image = tables.placement.image;
-        store_word(tables.image, load_word(in.images[loaded.image]));
+        copy_table(tables.image, in.images[loaded.image]);
         __syncwarp();
         if (threadIdx.x % 32 == 0) tables.limits = tables.image.camera.limits();
     }

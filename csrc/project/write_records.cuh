@@ -18,9 +18,10 @@ struct ItemTraits {
 };
 
 // Computes the record of gaussian g, whose mean is p in view space, and its pixel
-// `box`. Returns whether the gaussian reaches a pixel centre; if !traits.are_small, a
-// few that reach none are included. There is no early return, not even if the lane has
-// no gaussian (!is_one), because all lanes of a warp stay together.
+// `box`. Returns whether the gaussian reaches a pixel centre. Unless traits.are_small,
+// the result is also true for a few gaussians that reach none. There is no early
+// return, not even if the lane has no gaussian (!is_one), because all lanes of a warp
+// stay together.
 template <class Source, class C>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in,
                             const ModelView<float>& view, typename Source::Place place, uint32_t g,
@@ -49,8 +50,8 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
 
 // Writes the records of the lanes' gaussians from index `first` on, in lane order, and
 // adds them to the counts of tiles. Returns the number of records. `sharers` are the
-// placements of a shared item. `factors` are those of the sharers or, if the item is
-// not shared, of its placement; null if the source has no factors.
+// placements of a shared item. `factors` points to the factors of the sharers or, if
+// the item is not shared, of its placement. It is null if the source has no factors.
 template <class Source, bool kIsShared, class C>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
                                   const Placement* sharers, const InstanceFactors* factors,

@@ -1,5 +1,5 @@
-// Codebooks by Lloyd's algorithm, starting from the density of the values. Palettes by
-// repeatedly cutting sets in two.
+// Computes codebooks by Lloyd's algorithm, starting from the density of the values.
+// Computes palettes by repeatedly cutting sets of vectors in two.
 
 #include "quantize/codebook.h"
 

@@ -13,8 +13,8 @@ namespace v3dg {
 constexpr size_t kCodebookSize = 256;
 
 // Fills a table of kCodebookSize ascending numbers that represent the values, by
-// Lloyd's algorithm. If there are at most kCodebookSize different values, the table
-// consists of these, and the largest is repeated at the end.
+// Lloyd's algorithm. If there are at most kCodebookSize different values, the table has
+// each of them, and repeats the largest at the end.
 void make_codebook(Span<const double> values, Span<double> table);
 
 // K vectors of some width that represent N vectors.

@@ -65,13 +65,13 @@ void check_is_finite(const GaussianRows<const float>& in, size_t row) {
     for (int k = 0; k < num_sh; ++k) sum += in.sh[num_sh * row + k] * 0;
     if (!(sum == 0))
         throw std::invalid_argument(
-            "gaussians: expected finite values, got infinite or NaN ones at " +
+            "gaussians: expected finite values, got infinite or NaN ones in row " +
             std::to_string(row));
 }
 
-// Sets the scales, as bits of floats, and x, y, z of the quaternion. The axes are
-// permuted only if the quaternion cannot be coded as it is. So encoding a decoded
-// gaussian gives the same codes.
+// Sets the scales, as bits of floats, and x, y, z of the quaternion. If the quaternion
+// cannot be coded, the axes are permuted. Axes that can be coded are kept, so that
+// encoding a decoded gaussian gives the same codes.
 void prepare_shape(const float* quat, const float* scale, Prepared& out) {
     double length2 = 0, q[4] = {1, 0, 0, 0};
     for (int k = 0; k < 4; ++k) length2 += double(quat[k]) * quat[k];
@@ -211,8 +211,8 @@ int most_sh_code(int sh_degree, int basis, int channel) {
 
 // Computes the step of each band and channel as a half: the largest value divided by
 // the square of the largest code. A channel with values below 2^-11 of the brightness
-// is dropped. This is less than the smallest step of the brightness, and would be lost
-// when converting to red, green and blue in float32.
+// is dropped. Such values are less than the smallest step of the brightness, and would
+// be lost when converting to red, green and blue in float32.
 void sh_steps_of(const GaussianRows<const float>& in, uint16_t* steps) {
     const int num_bases = num_sh_bases(in.sh_degree);
     double most[9] = {};

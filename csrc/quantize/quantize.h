@@ -103,7 +103,7 @@ constexpr size_t slot_cluster_bytes(int sh_degree) {
 struct SlotPage {
     PageCodes<const uint32_t> page;
     size_t row, cluster;  // first row and cluster of the slot
-    // clusters of the slot; those that the page does not have become empty
+    // Number of clusters of the page. The remaining clusters of the slot become empty.
     size_t num_clusters;
 };
 

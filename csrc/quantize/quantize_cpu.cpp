@@ -57,7 +57,7 @@ CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
              .sh_degree = sh_degree,
              .range_size = range_bytes(sh_degree),
              .sh_stride = static_cast<uint32_t>(sh_degree)} {
-    // offset of each page, in words
+    // Offset of each page, in words.
     std::vector<uint64_t> place(first_cluster.size, 0);
     const auto page_at = [&](size_t p) {
         const auto first = static_cast<size_t>(first_cluster[p]),

@@ -57,7 +57,7 @@ void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream
 }
 
 void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream) {
-    static_assert(kRecordWords == 4, "a record is a vector");
+    static_assert(kRecordWords == 4, "a record is loaded as one vector of four words");
     launch("write_slots", write_slots_kernel, static_cast<unsigned>(num_pages), kBlockSize, 0,
            stream, pages, to);
 }

@@ -39,7 +39,7 @@ struct ClusterCode {
     uint16_t color_step[3];             // halves, in units of kStepUnit
     uint16_t scale_first, scale_step;
 };
-static_assert(sizeof(ClusterCode) == 40, "a format of files");
+static_assert(sizeof(ClusterCode) == 40, "the file format fixes the size of ClusterCode");
 
 // Returns the bytes of a cluster's ranges: a ClusterCode, then three halves per SH band
 // above degree 0.
@@ -71,7 +71,7 @@ V3DG_HD constexpr size_t page_bytes(size_t num_gaussians, size_t num_clusters, i
 // Converts a finite half to a float.
 V3DG_HD inline float float_of_half(uint32_t half) {
     const uint32_t exponent = half >> 10 & 31, fraction = half & 1023;
-    // 2^-24
+    // A denormal half is `fraction` * 2^-24.
     const float size = exponent == 0 ? static_cast<float>(fraction) * 5.9604645e-8f
                                      : float_of_bits((exponent + 112) << 23 | fraction << 13);
     return half & 0x8000 ? -size : size;
@@ -89,7 +89,8 @@ struct alignas(16) ClusterRanges {
     float sh_step[9];               // [band][channel]
 };
 V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degree + 3) / 4 * 16; }
-static_assert(range_bytes(3) == sizeof(ClusterRanges), "all of it");
+static_assert(range_bytes(3) == sizeof(ClusterRanges),
+              "the largest degree must use the whole struct");
 
 // The gaussians of a bundle as codes, on the host or on a device. Row r of cluster c
 // has four words of `records`, from index 4 (record_base + r) on. It has two words per
@@ -167,7 +168,7 @@ V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const Cluste
             y = number_at<V>(c, 19, 9) - float(kZeroQuat),
             z = number_at<V>(d, 23, 9) - float(kZeroQuat);
     g.quat[0] =
-        // the operands are integers, so the sum is exact
+        // The operands are integers, so the sum is exact.
         exact_sqrt(float(kQuatLength2) - x * x - y * y - z * z) * kQuatStep;
     g.quat[1] = x * kQuatStep;
     g.quat[2] = y * kQuatStep;

@@ -20,7 +20,7 @@ namespace v3dg {
 namespace cuda {
 
 static_assert(SubTile<2>::kColumns == 2 && SubTile<2>::kHeight == 4 && kEntryBlockSize == 4,
-              "place_of(), subs_of(), publish_alive() and reached_cells() know this");
+              "place_of(), subs_of(), publish_alive() and reached_cells() require it");
 
 // The pixels that a lane blends.
 template <int kPixels>
@@ -165,9 +165,10 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
     // The asm hides the lane index from the compiler. Otherwise the compiler would keep
-    // values that depend on the lane in registers between batches, and spill others.
+    // values that depend on the lane in registers between batches, and spill other
+    // values.
     asm volatile("" : "+r"(lane));
-    // The list is filled from its end to its beginning.
+    // The list is filled from the end of the array to its beginning.
     constexpr uint32_t kEach = sizeof(s.list[0][0]);
     const auto list =
         static_cast<uint32_t>(__cvta_generic_to_shared(s.list[threadIdx.x / 32] + kBlendBatch));
@@ -183,7 +184,7 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         listed += __popc(reaching);
     }
     __syncwarp();
-    // orders the list's stores before the loads of listed_at()
+    // The asm orders the list's stores before the loads of listed_at().
     asm volatile("" ::: "memory");
 
     using Sub = SubTile<kPixels>;
@@ -220,8 +221,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
-        // Load the next index ahead of its use. After the last record, the loaded value
-        // is not used.
+        // Load the next index ahead of its use. The value after the last record is not
+        // used.
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = listed_at(last_of_group + kEach * highest);
         while (bits != 0) {

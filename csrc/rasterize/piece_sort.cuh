@@ -11,21 +11,21 @@ namespace cuda {
 
 constexpr int kBlendThreads = 128;
 constexpr int kBlendWarps = kBlendThreads / 32;
-// entries that are read together
+// Entries that are read together.
 constexpr int kWindow = kEntriesAtOnce * kBlendThreads;
 constexpr int kPiece = 3 * kWindow / 2;  // most entries that are sorted together
-// log2 of the buckets when a list is spread a second time
+// Log2 of the buckets when a list is spread a second time.
 constexpr int kLog2SpreadAgain = 10;
 constexpr int kLog2Sort = 9;         // log2 of the buckets for sorting a piece
 constexpr uint32_t kMostAlike = 12;  // a bucket with more entries is crowded
-// If more of the sampled entries (one per thread) are in crowded buckets, a piece is
-// sorted with finer buckets.
+// The number of sampled entries (one per thread) in crowded buckets, above which finer
+// buckets are used.
 constexpr uint32_t kMostCrowded = kBlendThreads / 4;
 constexpr int kFewEntries = 64;   // up to this many entries are sorted without buckets
 constexpr int kBlendBatch = 192;  // records that are blended together
-// How often a list can be spread in turn. The range of the first level is estimated.
-// Each further level resolves at least 4 bits: first of the depth (26 bits), then of
-// the order (28 bits).
+// The largest number of times that a list is spread again. The range of the first level
+// is estimated. Each further level resolves at least 4 bits: first of the depth (26
+// bits), then of the order (28 bits).
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 
@@ -35,12 +35,12 @@ template <int kPixels>
 struct SubTile {
     static constexpr int kWidth = 8 * kPixels, kHeight = 4, kColumns = kFrameTileWidth / kWidth;
     static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;
-    // blocks per sub-tile; all are in one row of the tile's blocks
+    // The number of blocks per sub-tile. They are in one row of blocks.
     static constexpr int kBlocks = kWidth / kEntryBlockSize;
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
-static_assert(2 * kFewEntries <= kBlendThreads, "two threads rank an entry");
+static_assert(2 * kFewEntries <= kBlendThreads, "two threads compute the rank of each entry");
 
 // A part of the list that is in bucket order, and ends before `end`. It is in
 // lists.entries or in scratch memory.
@@ -58,8 +58,8 @@ struct ListWindow {
 };
 
 // The state of a tile's pixels, in areas of 8 x 4 pixels. In areas of odd columns, the
-// upper and lower halves are exchanged. Then the pixels of half a warp are in different
-// banks, with one pixel per lane as with two.
+// upper and lower halves are exchanged, so that the pixels of half a warp are in
+// different banks. This holds for one and for two pixels per lane.
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
@@ -74,11 +74,11 @@ struct BlendShared {
             uint32_t warp_sum[kBlendWarps];
             uint16_t by_bucket[kPiece];
         };
-        // the batch's records, without their boxes
+        // The batch's records, without their boxes.
         float4 record[kRecordVectors][kBlendBatch];
     };
     uint16_t sorted[kPiece];  // indices into `key`
-    // live blocks that each record of the batch may reach
+    // Live blocks that each record of the batch may reach.
     uint32_t blocks[kBlendBatch];
     // Per warp: the records that may reach its sub-tile, as addresses in shared memory.
     // An array is filled from its end to its beginning. Its first element is never set,
@@ -101,8 +101,8 @@ struct BlendShared {
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared) < 1 << 15,
-              "`list` has 16 bits; a block's memory begins within the lower half");
-static_assert(kBlendBatch % 32 == 0, "a warp takes 32 records");
+              "addresses in `list` have 16 bits, and BlendShared begins below 32 KiB");
+static_assert(kBlendBatch % 32 == 0, "a warp processes 32 records at once");
 
 // Returns the end of the bucket that contains entry `first`. The entries up to `last`
 // must be in bucket order.
@@ -219,8 +219,8 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
     return before;
 }
 
-// The steps of sorting a piece by buckets. The counters of buckets are 0 first. Then
-// they hold the first index of each bucket, and in the end that of the next bucket.
+// The steps of sorting a piece by buckets. The counter of a bucket is 0 first. Then it
+// is the first index of the bucket, and in the end the first index of the next bucket.
 template <class SomeBuckets>
 __device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
                               BlendShared& s) {
@@ -265,8 +265,8 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
     }
     if (few) return;
     count_buckets(buckets, s.bucket, count, s);
-    // An entry is compared with all others in its bucket. A sample of entries shows
-    // whether most buckets are crowded, so that finer buckets are faster.
+    // Each entry is compared with every other entry of its bucket. A sample of entries
+    // shows whether most buckets are crowded, so that finer buckets are faster.
     const bool is_crowded =
         threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);

@@ -35,7 +35,7 @@ namespace cuda {
 
 // The results of the forward pass that the backward pass needs, in device memory.
 struct RasterTape {
-    // The records of each tile in blending order, without those that could not change
+    // The records of each tile in blending order, without records that could not change
     // any pixel. The array is as long as the entries; the records of tile t begin at
     // tile_first[t].
     uint32_t* order;
@@ -63,7 +63,7 @@ struct RasterizeBackwardInput {
     // [num_tiles] number of records in `order` until all pixels had stopped
     const uint32_t* blended;
     const TilePlan* plans;  // [num_tiles] in the order in which blocks process tiles
-    // of the only picture; unused with a PictureBatch
+    // The gradient of the only picture; unused with a PictureBatch.
     PictureGradient<float> d_picture;
 };
 

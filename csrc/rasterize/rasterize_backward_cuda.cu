@@ -32,7 +32,7 @@ template <bool kWithSize>
 constexpr int kValuesOf = kGradientValues + (kWithSize ? kSizeValues : 0);
 static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
 constexpr int kTogether = 2;  // gaussians that are blended without a branch in between
-static_assert(kPairs >= kWarps, "one entry fits");
+static_assert(kPairs >= kWarps, "a batch must have room for all pairs of an entry");
 static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
 
 // One pixel's contribution to the gradient of a gaussian.
@@ -48,7 +48,8 @@ static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStr
 struct Batch {
     uint32_t slot[kBatch];
     uint32_t first_pair[kBatch];
-    // bit k: the k-th warp of those that may blend the entry did blend it
+    // Bit k is set if warp k, counted among the warps that may blend the entry, blended
+    // it.
     uint32_t took_part[kBatch];
 };
 
@@ -56,7 +57,7 @@ template <bool kWithSize>
 struct Shared {
     Record<float> record[kBatch + 1];  // the last record is invisible
     uint32_t warps[kBatch];            // bit w: warp w may blend the entry
-    // indices of entries that a warp may blend, padded with kBatch
+    // Indices of entries that a warp may blend, padded with kBatch.
     uint8_t list[kWarps][kBatch + kHeld];
     uint32_t pairs_of_warp[kBatch / 32];
     uint32_t alive;  // bit w: a pixel of warp w has not stopped
@@ -70,7 +71,8 @@ struct Shared {
     float d_background[kWarps][3];
 };
 
-static_assert(sizeof(Shared<true>) <= 99 * 1024, "the most that a block can have on every device");
+static_assert(sizeof(Shared<true>) <= 99 * 1024,
+              "some devices have 99 KiB of shared memory per block");
 
 // Returns the warps whose pixels the record may reach, one bit per warp. Nothing is
 // rounded to pixel centres. A tile marks the gradient slots of all records that it
@@ -102,8 +104,8 @@ struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
     float total,
-        // Sums of weight * (gradient with respect to the weight): over all gaussians,
-        // and over those visited so far.
+        // Sums of weight * (gradient with respect to the weight): `total` over all
+        // gaussians, `running` over the gaussians visited so far.
         running;
     float transmittance;
 };
@@ -233,7 +235,7 @@ __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, in
     for (int first = 0; first < count && alive; first += kHeld) {
         const int held = min(kHeld, count - first);
         for (int h = 0; h < held; h += kTogether) {
-            // stored only after all loads, so that these overlap
+            // The shares are stored after all loads, so that the loads overlap.
             Share share[kTogether];
 #pragma unroll
             for (int k = 0; k < kTogether; ++k)
@@ -293,8 +295,8 @@ __global__ void __launch_bounds__(kThreads, 2)
     Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
     const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
-                                 // tells the compiler that the value is uniform in the
-                                 // warp
+                                 // The shuffle tells the compiler that the value is
+                                 // uniform in the warp.
                                  0);
     const uint32_t tile = in.plans[blockIdx.x].tile;
     const uint32_t number = in.plans[blockIdx.x].image;
@@ -333,8 +335,8 @@ __global__ void __launch_bounds__(kThreads, 2)
     const int i = threadIdx.x;
     int first = 0, num = 0;
     for (int turn = 0;; turn ^= 1) {
-        // Some warps sum the pairs of the previous batch, while the others load this
-        // one.
+        // Some warps sum the pairs of the previous batch, while the other warps load
+        // this batch.
         const bool goes_on = first < count && s.alive != 0;
         Batch& entries = s.batch[turn];
         uint32_t end_pair = 0;
@@ -361,7 +363,8 @@ __global__ void __launch_bounds__(kThreads, 2)
             for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
             entries.first_pair[i] = end_pair - __popc(s.warps[i]);
         }
-        // The batch ends with the last entry whose pairs fit.
+        // The batch takes entries as long as there is room for their (entry, warp)
+        // pairs.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
         blend_batch_vjp<kWithDepth, kWithSize>(s, entries, warp, num, p, warp_left + 0.5f,
                                                warp_top + 0.5f);

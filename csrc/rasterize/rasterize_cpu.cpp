@@ -50,9 +50,9 @@ void rasterize_tile(const Record<T>* records, EntryFormat format, const uint64_t
         const Finished<T> pixel = finished(tile.transmittance[p], picture.min_transmittance);
         const T alpha = 1 - pixel.transmittance;
         for (int c = 0; c < 3; ++c)
-            picture.color[3 * out + c] =
+            picture.color[picture.color_step * out + c] =
                 pixel.gain * tile.color[c][p] + pixel.transmittance * picture.background[c];
-        picture.alpha[out] = alpha;
+        if (picture.alpha != nullptr) picture.alpha[picture.alpha_step * out] = alpha;
         if (picture.count != nullptr)
             picture.count[out] = tile.extra[p];
         else if (picture.depth != nullptr)

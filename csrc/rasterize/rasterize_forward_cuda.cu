@@ -19,14 +19,14 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-// resident blocks per multiprocessor with 228 KiB of shared memory, without depth
+// Resident blocks per multiprocessor with 228 KiB of shared memory, without depth.
 constexpr int kBlocks = 8;
-// From this average number of blocks per record on, a lane blends two pixels. Values of
-// 4, 7 and 10 differ by 1 % of the time.
+// The average number of blocks per record from which on a lane blends two pixels. The
+// values 4, 7 and 10 differ by 1 % in time.
 constexpr int kBlocksForPairs = 5;
 
 static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10,
-              "the driver keeps 1024 of each");
+              "the driver reserves 1024 bytes of shared memory per block");
 
 // Returns a mask of the blocks in a part of a tile: all of it, a half or a quarter.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
@@ -128,7 +128,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
                 held = taken.y;
                 continue;
             }
-            // Not even one bucket fits: spread it again.
+            // If not even one bucket fits, spread that bucket again.
             const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
             const Buckets buckets =
                 find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);
@@ -207,6 +207,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
     const PicturePlanes& planes = planes_of(lists, image);
+    const size_t num_channels = planes.has_four_channels ? 4 : 3;
     for_each_pair([&](int, int place, int x, int y) {
         for (int k = 0; k < 2 && x + k < image.width && y < image.height; ++k) {
             const size_t out = static_cast<size_t>(y) * image.width + x + k;
@@ -214,13 +215,30 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
                 finished(s.pixels.transmittance[place + k], lists.min_transmittance);
             const float alpha = 1 - pixel.transmittance;
             for (int c = 0; c < 3; ++c)
-                planes.color[3 * out + c] = pixel.gain * s.pixels.color[c][place + k] +
-                                            pixel.transmittance * image.background[c];
-            planes.alpha[out] = alpha;
+                planes.color[num_channels * out + c] = pixel.gain * s.pixels.color[c][place + k] +
+                                                       pixel.transmittance * image.background[c];
+            if (planes.has_four_channels) planes.color[4 * out + 3] = alpha;
+            if (planes.alpha != nullptr) planes.alpha[out] = alpha;
             if (kWithDepth)
                 planes.depth[out] = alpha > 0 ? pixel.gain * s.depth[place + k] / alpha : 0.0f;
         }
     });
+}
+
+// Fills the marked images with NaN, so that old pixels are not mistaken for new ones.
+__device__ void mark_undrawn(const FrameLists& lists) {
+    for (uint32_t k = blockIdx.x; k < lists.num_marked; k += gridDim.x) {
+        const FrameImage& image = lists.images[k];
+        const PicturePlanes& planes = image.planes;
+        const size_t num_pixels = size_t(image.width) * image.height;
+        const size_t num_channels = planes.has_four_channels ? 4 : 3;
+        for (size_t i = threadIdx.x; i < num_channels * num_pixels; i += kBlendThreads)
+            planes.color[i] = NAN;
+        for (size_t i = threadIdx.x; i < num_pixels; i += kBlendThreads) {
+            if (planes.alpha != nullptr) planes.alpha[i] = NAN;
+            if (planes.depth != nullptr) planes.depth[i] = NAN;
+        }
+    }
 }
 
 template <class Stop>
@@ -229,7 +247,10 @@ __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     await_kernel_before();
     if (blockIdx.x == 0 && threadIdx.x == 0 && lists.report != nullptr)
         *lists.report = *lists.counters;
-    if (!lists.capacity.holds(*lists.counters)) return;
+    if (!lists.capacity.holds(*lists.counters)) {
+        mark_undrawn(lists);
+        return;
+    }
     BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
     if (lists.plans[blockIdx.x].tile == kNoTile) return;
     const int part = lists.plans[blockIdx.x].part;

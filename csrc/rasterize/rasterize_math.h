@@ -27,7 +27,7 @@ V3DG_HD V3DG_INLINE Falloff<V> falloff_at(V x, V y, V u, V v, V l11, V l12, V l2
     f.dy = y - v;
     f.t1 = l11 * f.dx + l12 * f.dy;
     f.t2 = l22 * f.dy;
-    // The order of the terms lets the pixels of a row share all but the last one.
+    // The terms are ordered so that the pixels of a row share all but the last one.
     f.exponent = log2_opacity - f.t2 * f.t2 - f.t1 * f.t1;
     return f;
 }
@@ -116,9 +116,9 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
 }
 
 // Returns the gradient with respect to the exponent of a gaussian that was blended with
-// `alpha` and `weight`. `before` is the transmittance in front of it, and `by_weight`
-// the gradient with respect to its weight. `behind` is the sum of weight times
-// by_weight over all gaussians behind it.
+// `alpha` and `weight`. `before` is the transmittance in front of the gaussian.
+// `by_weight` is the gradient with respect to its weight. `behind` is the sum of weight
+// times by_weight over all gaussians behind it.
 template <class V>
 V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
     // Alpha increases the gaussian's own weight, and reduces the weights of all
@@ -196,7 +196,7 @@ V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBehi
     const float alpha = capped_alpha_of(f);
     if (contributes(f)) {
         add(alpha * t);
-        // after the last use of `t`, so that no copy is needed
+        // Unlike with StopsBefore, the old value of `t` is not needed.
         t = transmittance_behind(alpha, t);
     }
     return t > stop.transmittance;
@@ -228,8 +228,8 @@ V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, fl
     const float inverse = kScale * rough_reciprocal(l11), slope = -l12 * inverse,
                 wider = inverse * (1 + 2e-3f);
     // The range begins with the first cell whose last pixel is not left of the ellipse.
-    // It ends behind the last cell whose first pixel is not right of it. Both values
-    // are rounded to integers later; half a cell is added for this.
+    // It ends after the last cell whose first pixel is not right of the ellipse. Half a
+    // cell is added, because both numbers are rounded to the nearest integer later.
     const float first_u = kScale * u + kScale * (1 - 0.5f * kPixels - kMargin),
                 end_u = kScale * u + kScale * (0.5f * kPixels + kMargin);
     uint32_t cells = 0;

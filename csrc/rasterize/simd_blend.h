@@ -30,7 +30,7 @@ struct BatchRecord {
     V3DG_INLINE void take(const Record<T>& g, int left, int top) {
         static_assert(
             sizeof *this <= sizeof g && offsetof(Record<T>, depth) == offsetof(BatchRecord, depth),
-            "the first part of a record");
+            "BatchRecord must have the layout of the first part of a Record");
         std::memcpy(static_cast<void*>(this), &g, sizeof *this);
         u = g.u - T(left);
         v = g.v - T(top);
@@ -133,8 +133,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
             const Falloff<V> f = falloff_at(
                 x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v, all_lanes<V>(g.l11),
                 all_lanes<V>(g.l12), all_lanes<V>(g.l22), all_lanes<V>(g.log2_opacity));
-            // Skip vectors without any contribution. If a vector covers the whole
-            // block, there are few of them, so the test is left out.
+            // Skip vectors without any contribution. If a vector covers a whole block,
+            // this is rare, so the test is left out.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
             const V weight = blend_weight(alpha_of(f), t, stop);
             red += weight * all_lanes<V>(g.color[0]);

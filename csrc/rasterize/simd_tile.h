@@ -4,9 +4,9 @@
 // which fits into the L1 cache.
 //
 // A tile has 8 x 8 blocks of 4 x 4 pixels. A 64-bit mask has a bit per block. One mask
-// has the blocks that a gaussian may touch. Another has the live blocks: those with a
-// pixel that has not stopped. If the masks of a gaussian and of live blocks do not
-// overlap, the gaussian costs only a few integer operations.
+// has the blocks that a gaussian may touch. Another mask has the live blocks, in which
+// at least one pixel has not stopped. If the two masks do not overlap, the gaussian
+// costs only a few integer operations.
 
 #include <cstdint>
 
@@ -21,7 +21,7 @@ namespace V3DG_ISA {
 constexpr int kBlockPixels = kBlockSize * kBlockSize;
 constexpr int kTilePixels = kTileSize * kTileSize;
 
-// What is summed per pixel besides colour and transmittance.
+// The optional value that is summed per pixel, besides colour and transmittance.
 enum class Extra { kNothing, kDepth, kCount };
 
 // The pixels of a tile, block by block, 16 pixels each.
@@ -36,13 +36,13 @@ struct TilePlanes {
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
-    // gradient with respect to the sum of weight * depth
+    // Gradient with respect to the sum of weight * depth.
     alignas(64) T d_depth[kTilePixels];
     alignas(
         // The part of the gradient with respect to a weight that is equal for all
         // gaussians: from alpha and from the hidden background.
         64) T d_weight[kTilePixels];
-    // sum over gaussians of weight * (gradient with respect to the weight)
+    // Sum over gaussians of weight * (gradient with respect to the weight).
     alignas(64) T total[kTilePixels];
 };
 
@@ -59,10 +59,10 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
 // The number of touched blocks from which on the exact test pays off.
 constexpr int kFewBlocks = 5;
 
-// Returns those of `blocks` that the ellipse reaches. For each row of blocks, it
+// Returns the subset of `blocks` that the ellipse reaches. For each row of blocks, it
 // computes the extent of the ellipse in x over the rows of pixel centres, with the
-// margin of row_extent(). Rounding truncates, because that is a single instruction on
-// every instruction set.
+// margin of row_extent(). Values are rounded by truncation, because every instruction
+// set has a single instruction for it.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
@@ -122,7 +122,7 @@ inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window&
 template <class T>
 struct BlockPixels {
     alignas(64) T x[kBlockPixels], y[kBlockPixels];  // relative to the block's corner
-    // offset of each row or column of blocks, repeated in every lane
+    // Offset of each row or column of blocks, repeated in every lane.
     alignas(64) T corner[kTileBlocks][kLanes<T>];
     BlockPixels() {
         for (int k = 0; k < kTileBlocks; ++k)

@@ -21,7 +21,7 @@ constexpr int kSpreadThreads = 1024;
 constexpr int kMostParts = 4;  // most parts of a tile
 
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
-              "kPiece and kPiece / kMostParts begin classes of plan_kernel");
+              "kPiece and kPiece / kMostParts must be the lowest loads of classes");
 
 __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
@@ -52,9 +52,10 @@ struct PlanRules {
         const int octave = 31 - __clz(static_cast<int>(load));
         return kPlanClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
     }
-    // Returns the load from which on a list may be longer than kPiece. No plan behind
-    // the first smaller load has such a list, because a part has at least half a share,
-    // and the loads of a class differ by less than half of the smallest.
+    // Returns the smallest load of plans that may have lists longer than kPiece. In the
+    // order of plans, no such plan follows a plan with a smaller load, because a part
+    // has at least half a share, and the loads of a class differ by less than half of
+    // the smallest one.
     __device__ uint32_t least_of_long() const {
         constexpr uint32_t kLongest = kPiece, kLeastOfPart = kPiece / kMostParts;
         return has_parts ? max(min(share / 3, kLongest), kLeastOfPart) : kLongest;
@@ -84,7 +85,7 @@ __global__ void __launch_bounds__(kPlanThreads)
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
     __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
-    static_assert(kPlanClasses == 64, "a lane has two");
+    static_assert(kPlanClasses == 64, "each lane of a warp processes two classes");
     if (!lists.capacity.holds(*lists.counters)) return;
     const PlanRules rules(lists, num_places);
     const uint32_t tile = blockIdx.x * kPlanThreads + threadIdx.x;
@@ -92,7 +93,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
     const int log2_parts = rules.log2_parts_of(count), own_class = rules.class_of(count);
     if (threadIdx.x < kPlanClasses) in_block[threadIdx.x] = 0;
     __syncthreads();
-    // number of plans of this class that other tiles of the block took before
+    // Number of plans of this class that earlier tiles of the block have taken.
     uint32_t before = 0;
     if (tile < lists.num_tiles) before = atomicAdd(&in_block[own_class], 1u << log2_parts);
     __syncthreads();
@@ -139,7 +140,7 @@ __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t cou
 }
 
 // The smallest number of entries in a window. A window consists of whole buckets, so it
-// may have more, by less than a bucket.
+// may be longer by up to a bucket.
 constexpr uint32_t kWindowEntries = 3 * kWindow / 4;
 
 __device__ uint32_t num_window_ends(uint32_t count) {
@@ -149,7 +150,8 @@ __device__ uint32_t num_window_ends(uint32_t count) {
 // Returns the number of entries that a list needs if it is spread into windows: the
 // list, followed by the ends of its windows.
 __device__ uint32_t room_in_windows(uint32_t count) {
-    static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t), "two ends in the place of an entry");
+    static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t),
+                  "two ends of windows occupy the memory of an entry");
     return count + num_window_ends(count) / 2 + 1;
 }
 
@@ -228,7 +230,7 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
     uint32_t (&of_chunk)[1 << kLog2Spread] = space.finer;
     TileEntry* chunk = space.chunk;
     const uint32_t num_buckets = buckets.last + 1,
-                   // the counts of one chunk, in units of entries
+                   // Size of the counts of one chunk, in entries.
         counts_room = num_buckets / 4;
     uint32_t num_chunks = 1;
     const auto size_of_chunk = [&] { return (count + num_chunks - 1) / num_chunks; };
@@ -257,8 +259,9 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
         place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
     }
 
-    // Returns the first index of a bucket in the chunk. of_chunk[b] holds that of the
-    // next bucket.
+    // Returns the index in the chunk at which bucket b begins. Call it only after all
+    // entries are placed: placing them has moved of_chunk[b] from the begin of bucket b
+    // to its end, which is the begin of bucket b + 1.
     const auto begin_of = [&](uint32_t b) { return b > 0 ? of_chunk[b - 1] : 0; };
     for (uint32_t k = 0; k < num_chunks; ++k) {
         const uint32_t first = k * size, last = min(first + size, count);
@@ -294,7 +297,7 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
 __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count,
                             uint32_t most_held, SpreadSpace& space) {
     static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0,
-                  "entries lie where `finer` does");
+                  "entries share the memory of `finer`, so it must be aligned for them");
     SpreadShared<kLog2Spread>& s = space.even;
     auto* held = reinterpret_cast<TileEntry*>(&space.finer);
     if (count <= kPiece || plan.part != 0) return;
@@ -359,7 +362,7 @@ __global__ void __launch_bounds__(kSpreadThreads, 2)
         if (threadIdx.x == 0) next_of_block = next;
         __syncthreads();
         i = next_of_block;
-        __syncthreads();  // the next iteration overwrites it
+        __syncthreads();  // the next iteration overwrites next_of_block
     }
 }
 
@@ -374,8 +377,9 @@ uint32_t most_held() {
 }  // namespace
 
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places) {
-    // A tile is divided into two or four parts if its load is one or two shares. There
-    // are num_places shares, so this many plans are added at most.
+    // A tile with at least one share of the load is divided in two, and a tile with at
+    // least two shares in four. There are num_places shares, which bounds the number of
+    // plans.
     return num_tiles + (kMostParts - 1) * num_places / 2 + 1;
 }
 

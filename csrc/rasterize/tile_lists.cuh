@@ -100,7 +100,7 @@ __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
     __syncthreads();
 }
 
-// Calls visit(entry) for those of the entries [first, last) that this thread processes.
+// Calls visit(entry) for each entry of [first, last) that this thread processes.
 template <int kBlock, class Visit>
 __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last,
                                const Visit& visit) {
@@ -123,7 +123,7 @@ template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                                 bool roughly, bool finely, SpreadShared<kLog2Buckets>& s) {
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
-    // ranges of key_depth() and key_order()
+    // Ranges of key_depth() and key_order().
     uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};
     const auto widen = [&](TileEntry e) {
         const uint32_t part[2] = {key_depth(e), key_order(e)};
@@ -150,8 +150,9 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     }
     __syncthreads();
-    // About 64 entries per bucket. With few buckets, entries that are written to the
-    // same cache line more likely stay together in the cache.
+    // The number of buckets gives about 64 entries per bucket. With few buckets,
+    // entries that are written to the same cache line more likely stay together in the
+    // cache.
     const int log2_buckets =
         finely ? kLog2Buckets
                : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);

@@ -33,7 +33,7 @@ BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& a
                  .bounds = {},
                  .joins = nullptr,
                  .runs = runs_of_clusters(table)} {
-    static_assert(kClustersOfBounds <= 8, "a byte has a bit for each of them");
+    static_assert(kClustersOfBounds <= 8, "a byte of `joins` has one bit per cluster");
     const std::vector<ClusterBounds> bounds = bounds_of_clusters(table);
     const std::vector<uint8_t> joins = joins_of_clusters(table, appearance);
     on_device_.bounds = {bounds.data(), bounds.size()};

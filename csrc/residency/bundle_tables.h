@@ -14,9 +14,9 @@ struct BundleOnDevice {
     ClusterTable table;
     ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
-    // One byte per ClusterBounds. Bit k is set if its cluster k can be drawn together
-    // with the cluster before it: their rows are adjacent and their appearance is
-    // equal.
+    // One byte per ClusterBounds. Bit k is set if cluster k of the bounds can be drawn
+    // together with the preceding cluster, because their rows are adjacent and their
+    // appearance is equal.
     const uint8_t* joins;
     ClusterRuns runs;
 };

@@ -15,7 +15,7 @@ namespace {
 // where float32 loses precision.
 constexpr float kLeastRunRadius = 1e-15f;
 
-// Returns a ball that contains the centres of the balls. Without any, it is at the
+// Returns a ball that contains the centres of the balls. Without balls, it is at the
 // origin.
 Ball ball_of_centers(Span<const Ball> balls) {
     double middle[3] = {0, 0, 0}, radius2 = 0;
@@ -85,7 +85,7 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
 ClusterRuns runs_of_clusters(const ClusterTable& table) {
     const size_t count = table.num_clusters();
     ClusterRuns runs{};
-    // ends of the runs, in units of kClustersOfBounds clusters; last run first
+    // Ends of the runs, in units of kClustersOfBounds clusters; last run first.
     std::vector<size_t> ends;
     size_t left = (count + kClustersOfBounds - 1) / kClustersOfBounds;
     for (size_t size = 1; left > 0; size *= ends.size() > 1 ? 2 : 1) {

@@ -30,14 +30,14 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table);
 
 constexpr uint32_t kMostRuns = 24;
 
-// The clusters of a table, divided into a few runs. Selection tests a run with one
-// distance to the whole bundle. A table is ordered by level. So most runs are too fine
-// for a distant instance, and some are too coarse for a near instance. Sizes halve from
-// run to run: a run has as many clusters as all runs after it. The last run has the
-// clusters of one ClusterBounds.
+// The clusters of a table, divided into a few runs. Selection tests a run with a single
+// distance, to the whole bundle. A table is ordered by level. So for a distant instance
+// most runs are too fine, and for a near instance some runs are too coarse. Sizes halve
+// from run to run: a run has as many clusters as all runs after it. The last run has
+// the clusters of one ClusterBounds.
 struct ClusterRuns {
     uint32_t count;
-    // first cluster of each run, a multiple of kClustersOfBounds; and the end
+    // First cluster of each run, a multiple of kClustersOfBounds; and the end.
     uint32_t begin[kMostRuns + 1];
     Ball groups;           // contains the centres of the balls of all groups
     float least_distance;  // smallest distance to a ball for which the tests are valid

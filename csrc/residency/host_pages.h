@@ -32,7 +32,7 @@ class HostPages {
 
     Buffer<float> storage_;
     size_t stride_ = 0;  // length of a plane
-    // one per bundle: SH degrees may differ
+    // One per bundle: SH degrees may differ.
     std::vector<GaussianPlanes<float>> planes_;
 
     Buffer<uint32_t> records_, sh_;

@@ -4,7 +4,8 @@
 
 namespace v3dg {
 
-// The begin of an evicted page, which may still be in the list of waiting pages.
+// The value of begins_[page] for an evicted page, which may still be in the list of
+// waiting pages.
 constexpr int32_t kHasLeft = kNeverBegins - 1;
 
 PageArrivals::PageArrivals(const PagePolicy& policy)
@@ -30,7 +31,8 @@ void PageArrivals::advance(const std::vector<PageChange>& changes, Arrive arrive
     size_t num_kept = 0;
     for (size_t i = 0; i < waiting_.size(); ++i) {
         const auto [page, above] = waiting_[i];
-        // The page was evicted, or arrived again and has begun to fade in since.
+        // Skip the page if it was evicted, or if it arrived again and has begun to fade
+        // in.
         if (begins_[page] != kNeverBegins) continue;
         const bool is_next = frame_ - begins_[above] >= kArrivalFrames;
         if (!fades)

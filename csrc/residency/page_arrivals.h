@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// Whether arriving pages are drawn with full weight at once, or fade in.
+// The way in which arriving pages are drawn: with full weight at once, or fading in.
 enum class Arrive { at_once, fading };
 
 // The frame after which a page begins to fade in. `page` counts over all bundles.

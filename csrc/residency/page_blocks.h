@@ -57,7 +57,7 @@ class PageBlocks {
     size_t num_blocks() const { return num_blocks_; }
     size_t num_bytes() const { return num_bytes_; }
 
-    // Returns a block of at least this many bytes, or null if there is no free one.
+    // Returns a block of at least `bytes` bytes, or null if none is free.
     unsigned char* take(size_t bytes) {
         for (Size& size : sizes_) {
             if (size.size < bytes || size.free.empty()) continue;

@@ -17,12 +17,13 @@ namespace v3dg {
 
 namespace {
 
-// The priority of a page is at least this many times that of the pages below it.
+// The priority of a page is at least kAbove times the priority of each page below it.
 constexpr float kAbove = 2.0f;
 // The largest priority. Priorities near the eye are unbounded; they are clamped, so
 // that a page above can still have a higher priority.
 constexpr float kMostPriority = 1073741824.0f;
-constexpr size_t kMostLeaving = 4096;            // slots to evict that one search collects
+// Slots whose pages one search selects for eviction.
+constexpr size_t kMostLeaving = 4096;
 constexpr size_t kMostChosen = size_t(1) << 14;  // pages to read before the next choice
 constexpr int32_t kRootSlot = -2;
 constexpr int32_t kNoSlot = -1;
@@ -72,9 +73,8 @@ PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory
     size_t num_pages = 0;
     for (const PagedBundle& bundle : bundles) num_pages += bundle.table.num_pages();
     if (num_pages > INT32_MAX)
-        throw std::invalid_argument(
-            "memory: expected bundles of fewer than 2^31 pages together, got " +
-            std::to_string(num_pages));
+        throw std::invalid_argument("memory: expected fewer than 2^31 pages in all bundles, got " +
+                                    std::to_string(num_pages));
     slot_of_page_ = {slot_storage_.reserve(num_pages), num_pages};
     pages_ = {page_storage_.reserve(num_pages), num_pages};
     states_ = std::make_unique<std::atomic<PageState>[]>(num_pages);
@@ -122,9 +122,9 @@ void PagePolicy::plan_memory(const PoolMemory& memory) {
     const size_t slot = memory.bytes_of(plan_.slot_rows, plan_.slot_clusters);
     const size_t least = roots + (num_pages > 0 ? bundles_.size() * slot : 0);
     if (memory.num_bytes < least || memory.most_rows < plan_.num_rows())
-        throw std::invalid_argument("memory: expected room for at least " + std::to_string(least) +
-                                    " bytes of gaussians, which are the coarsest pages of all "
-                                    "bundles and one more page of each, got room for " +
+        throw std::invalid_argument("memory: expected at least " + std::to_string(least) +
+                                    " bytes for gaussians (the coarsest page and one more page of "
+                                    "each bundle), got " +
                                     std::to_string(memory.num_bytes));
     plan_.num_slots =
         std::min({(memory.num_bytes - roots) / slot,
@@ -169,8 +169,7 @@ void PagePolicy::use(int32_t slot, bool is_needed) {
     }
 }
 
-// Searches this page and the pages above it for pages that failed. Returns the topmost
-// of these, or -1.
+// Returns the topmost page that failed, among this page and the pages above it, or -1.
 int32_t PagePolicy::block_above(int32_t id) const {
     int32_t blocked = -1;
     for (; id >= 0; id = pages_[id].parent)
@@ -179,7 +178,7 @@ int32_t PagePolicy::block_above(int32_t id) const {
 }
 
 // Adds an absent page, and the absent pages above it, to the wanted pages. Returns how
-// many of them the cut misses and were not counted before.
+// many of these pages the cut misses, without pages that were counted before.
 size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
     auto id = static_cast<int32_t>(id_of(request.bundle, request.page));
     const int32_t blocked = has_failures ? block_above(id) : -1;
@@ -228,7 +227,7 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
 
 // Sorts the wanted pages in the order of the file, and replaces the key of each page by
 // the key of its stretch. A stretch never has both a page and a page below it. The
-// stretch of a page is more urgent than those of the pages below.
+// stretch of a page is more urgent than the stretches of the pages below it.
 void PagePolicy::find_stretches() {
     std::sort(wanted_.begin(), wanted_.end(), [](const Wanted& a, const Wanted& b) {
         return a.bundle != b.bundle ? a.bundle < b.bundle : a.page < b.page;
@@ -283,8 +282,8 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
     const size_t unneeded = num_old(needed_), unused = num_old(used_);
     const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
     const size_t most = std::min(room > under_way ? room - under_way : 0, kMostChosen);
-    // The list begins with the least urgent pages. Leave out those for which there is
-    // no room.
+    // The list begins with the least urgent pages. Leave out the pages that have no
+    // room.
     size_t num_left_out = wanted_.size() > most ? wanted_.size() - most : 0;
     todo.resize(wanted_.size() - num_left_out);
     uint32_t end = 0;
@@ -331,8 +330,8 @@ void PagePolicy::find_leaving() {
     has_none_leaving_ = leaving_.empty();
 }
 
-// Removes slots that have been used since from the front of the heap. Returns whether a
-// slot is left that may be evicted.
+// Removes slots from the front of the heap if they have been used since they were
+// added. Returns whether a slot is left that may be evicted.
 bool PagePolicy::has_leaving() {
     while (!leaving_.empty()) {
         const Leaving& first = leaving_.front();

@@ -48,13 +48,13 @@ struct SlotPlan {
     size_t num_rows() const { return first_slot_row + num_slots * slot_rows; }
     size_t num_clusters() const { return first_slot_cluster + num_slots * slot_clusters; }
     // Returns the number of cluster entries that belong to a page of `num_clusters`
-    // clusters at entry `cluster`. A page in a slot has all entries of the slot, a
-    // coarsest page has one per cluster.
+    // clusters at entry `cluster`. A page in a slot has all entries of the slot; a
+    // coarsest page has one entry per cluster.
     size_t num_clusters_at(size_t cluster, size_t num_clusters) const {
         return cluster < first_slot_cluster ? num_clusters : slot_clusters;
     }
-    // Returns [num_clusters() + 1] the first row of each cluster entry if all slots are
-    // empty, ascending.
+    // Returns the first row of each cluster entry if all slots are empty. The result is
+    // ascending and has num_clusters() + 1 elements.
     std::vector<int64_t> empty_offsets() const;
 };
 
@@ -80,7 +80,7 @@ struct PagesComing {
     std::vector<PageChange> changes;      // in the order in which they must be applied
     std::vector<unsigned char*> dropped;  // blocks of pages that are no longer wanted
     size_t bytes = 0;                     // total size of the pages that become resident
-    // pages that wait only because of the limit on bytes per frame
+    // Pages that wait only because of the limit on bytes per frame.
     size_t num_left = 0;
 
     void clear();
@@ -145,23 +145,23 @@ class PagePolicy {
         size_t most_rows = 1, most_clusters = 1, most_bytes = 1;
     };
     struct Page {
-        // index among the pages of all bundles; -1 for a coarsest page
+        // Index among the pages of all bundles; -1 for a coarsest page.
         int32_t parent = -1;
         uint32_t stamp = 0;  // last view that requested the page
         float priority = 0;  // priority in that view
-        // stretch of the page in that view, if the page is wanted
+        // Stretch of the page in that view, if the page is wanted.
         uint32_t stretch = 0;
     };
     struct Slot {
         int32_t bundle = -1;
         uint32_t page = 0;
     };
-    // When the page in a slot was last used.
+    // The last use of the page in a slot.
     struct Use {
         uint32_t last_needed = 0;  // last view that needed the page, plus 1
-        // last view that needed, or nearly needed, the page, plus 1
+        // Last view that needed, or nearly needed, the page, plus 1.
         uint32_t last_used = 0;
-        // slot of the page above; negative if that is a coarsest page
+        // Slot of the page above; negative if the page above is a coarsest page.
         int32_t above = 0;
         uint32_t num_children = 0;  // number of resident pages directly below
     };
@@ -182,7 +182,8 @@ class PagePolicy {
         uint32_t count = 0;
         uint32_t end = 0;
     };
-    // A slot whose page may be evicted, unless the page has been used since.
+    // A slot whose page may be evicted, unless the page was used after the slot was
+    // added to the heap.
     struct Leaving {
         uint32_t last_used, slot;
 
@@ -200,7 +201,7 @@ class PagePolicy {
     int32_t block_above(int32_t id) const;
     void find_stretches();
     void touch(uint32_t& last, uint32_t value, Counts& counts);
-    // Returns whether neither this view nor the one before used the page.
+    // Returns whether neither this view nor the previous view used the page.
     bool is_old(uint32_t last) const { return last < noted_; }
     size_t num_old(const Counts& counts) const {
         return slots_.size() - counts.now - counts.before;
@@ -236,11 +237,11 @@ class PagePolicy {
     std::vector<Wanted> wanted_;
     std::vector<uint32_t> key_of_stretch_;
     std::vector<Places> places_of_key_;
-    // A heap of slots that may be evicted; the one that was unused for longest is in
-    // front. It is kept from frame to frame, because slots that become old later were
-    // also used later.
+    // A heap of slots that may be evicted. The slot that was unused for longest is in
+    // front. The heap is kept from frame to frame, because slots that become old later
+    // were also used later.
     std::vector<Leaving> leaving_;
-    // no slot can be evicted before the next view is noted
+    // True if no slot can be evicted before the next view is noted.
     bool has_none_leaving_ = false;
     std::vector<LoadedPage> left_;
 };

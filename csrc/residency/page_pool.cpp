@@ -21,9 +21,9 @@ namespace {
 
 constexpr float kToleranceLeap = 1.189207f;
 constexpr float kLeastToleranceRaised = 1e-6f;
-// approximate number of pages whose sizes are sampled
+// Approximate number of pages whose sizes are sampled.
 constexpr size_t kSamples = 1 << 14;
-// How long the destructor of a pool waits for the pool's threads.
+// The time that the destructor of a pool waits for the pool's threads.
 constexpr std::chrono::seconds kMostWaitForEnd{2};
 
 // Returns the sizes of about kSamples pages, without the coarsest ones.
@@ -47,7 +47,7 @@ struct PagePool::State {
     static void start_threads(const std::shared_ptr<State>& state);
     void stop_threads();
 
-    // After construction, only the decider accesses changing state of the policy.
+    // After construction, only the decider uses the parts of the policy that change.
     PagePolicy policy;
     std::shared_ptr<BlockMemory> memory;
     int max_sh_degree = 0;
@@ -127,9 +127,9 @@ PagePool::PagePool(const std::vector<PagedBundle>& bundles, const PoolLimits& li
     State::start_threads(state_);
 }
 
-// The state outlives the pool in two cases. A thread that waits for a disk for ever is
-// left behind, with the state that it writes to. And in a child of fork(), the mutex
-// must not be destroyed.
+// The state outlives the pool in two cases. A thread that waits for a disk for ever
+// keeps the state that it writes to. In a child of fork(), the mutex in the state must
+// not be destroyed.
 PagePool::~PagePool() {
     if (getpid() != state_->shared.process)
         static_cast<void>(new std::shared_ptr<State>(state_));

@@ -64,7 +64,7 @@ class PagePool {
     // between.
     const std::vector<PageChange>& begin_frame(bool is_bounded, Arrive arrive = Arrive::at_once);
     void set_most_bytes_a_frame(size_t bytes);
-    // Gives the blocks of the frame's changes back to the pool. To be called after the
+    // Gives the blocks of the frame's changes back to the pool. Call this after the
     // bytes were copied.
     void release();
     // Two-step version of release(), for callers that copy asynchronously.

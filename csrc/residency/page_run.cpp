@@ -10,7 +10,7 @@
 
 namespace v3dg {
 
-// Pages that a thread reads at once; as many hashes are computed in parallel.
+// The number of pages that a thread reads at once: as many as are hashed in parallel.
 constexpr size_t kFew = 8;
 
 static std::string name_of(const PageRun& run, size_t page) {

@@ -14,7 +14,7 @@ struct PageRun {
     size_t first_page;  // index of the first page in the bundle
     // [n + 1] first cluster of each page, relative to the first page, and the end
     Span<const int64_t> first_cluster;
-    // first gaussian of each cluster, and the end; indices in the bundle
+    // First gaussian of each cluster, and the end; indices in the bundle.
     Span<const int64_t> offset;
     // [n + 1] offset of each page in the file, bytes, and the end
     Span<const int64_t> places;

@@ -23,7 +23,7 @@ class PageError : public std::runtime_error {
   public:
     PageError(const std::string& text, bool is_damage, int code = 0)
         : std::runtime_error(text), is_damage(is_damage), code(code) {}
-    // true if the content of the file is wrong; false if the system failed to read it
+    // True if the content of the file is wrong; false if the system failed to read it.
     const bool is_damage;
     const int code;  // errno of the system call, or 0
 };

@@ -14,7 +14,7 @@ constexpr int64_t kAbsentPage = INT64_MIN;
 constexpr int32_t kArrivalFrames = 8;
 constexpr int32_t kNeverBegins = INT32_MAX, kBegunLongAgo = -kArrivalFrames;
 
-// Where the pages of a bundle are in memory. Page g has the clusters that group g
+// The locations of a bundle's pages in memory. Page g has the clusters that group g
 // replaces; the last page has the clusters that no group replaces.
 //
 // A cut refines only groups whose page is resident. The cut is exact if, for each

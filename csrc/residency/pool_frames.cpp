@@ -44,7 +44,8 @@ void PoolFrames::reserve(size_t num_blocks, size_t num_changes, size_t num_frame
     changes_.reserve(num_changes);
     taken_.reserve(num_blocks);
     returned_.reserve(num_blocks);
-    // two more than frames: one waits for the decider, and one is being decided about
+    // There are two more buffers than frames in flight: one waits for the decider, and
+    // the decider is using one.
     all_needs_.resize(num_frames + 2);
     for (FrameNeeds& needs : all_needs_) {
         needs.list =
@@ -57,7 +58,7 @@ const std::vector<PageChange>& PoolFrames::begin_frame(PoolShared& shared, bool 
                                                        Arrive arrive) {
     least_of_frame_ = shared.least_tolerance;
     const bool is_first = !std::exchange(has_begun_, true);
-    // the coarsest pages are already in `changes_`
+    // In the first frame, `changes_` already has the coarsest pages.
     if (!is_first) take_changes(shared, is_bounded);
     const bool is_after_look = std::exchange(has_looked_, !is_bounded);
     arrivals_.advance(changes_, is_bounded && !is_after_look ? arrive : Arrive::at_once);
@@ -169,7 +170,7 @@ NotedView PoolFrames::note_needs(PoolShared& shared, FrameNeeds* needs, bool wai
     return noted;
 }
 
-// Returns how many pages the cut missed, by the tables of the current frame.
+// Returns how many pages the cut missed, according to the tables of the frame.
 size_t PoolFrames::count_absent(const FrameNeeds& needs) const {
     size_t count = needs.num_left_out;
     for (size_t k = 0; k < needs.count; ++k) {
@@ -183,7 +184,7 @@ void PoolFrames::begin_settling(PoolShared& shared) {
     const PoolLock lock(shared);
     exchange(shared);
     forget_noted(shared);
-    // Wait: a round in progress may change the tolerance at its end.
+    // Wait, because a round in progress may change the tolerance at its end.
     while (shared.is_deciding()) shared.has_changed.wait(shared.busy);
     decider_.forget_failures(shared);
     shared.least_tolerance = 0;

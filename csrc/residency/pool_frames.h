@@ -3,9 +3,10 @@
 // The frames of a page pool: the pages that a frame gets, and the page requests that it
 // returns.
 //
-// Only one thread at a time uses it, the drawing thread, as callers of PagePool ensure.
-// So its fields need no mutex. Functions with `waits`, and frames that are not bounded,
-// wait for the mutex and for the next round of the decider; no other function waits.
+// The callers of PagePool ensure that only one thread at a time, the drawing thread,
+// uses this class. So its fields need no mutex. Functions with `waits`, and frames that
+// are not bounded, wait for the mutex and for the next round of the decider. No other
+// function waits.
 
 #include <cstddef>
 #include <cstdint>

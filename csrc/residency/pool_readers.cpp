@@ -1,5 +1,5 @@
-// Reads batches of the most urgent pages. A batch is taken with the mutex held, read
-// without it, and reported with it held.
+// Reads batches of the most urgent pages. A reader takes a batch with the mutex held,
+// reads it without the mutex, and reports it with the mutex held.
 
 #include "residency/pool_readers.h"
 
@@ -12,7 +12,7 @@ namespace v3dg {
 namespace {
 
 constexpr int kTries = 3;
-// pages that a thread announces to the disk together
+// Pages that a thread announces to the disk together.
 constexpr size_t kMostAtOnce = 64;
 // The bytes of pages that a thread reads and hashes together.
 constexpr size_t kMostBytesTogether = size_t(512) << 10;
@@ -77,7 +77,8 @@ void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
     });
 }
 
-// Reads pages of one bundle. Reports pages that succeed, and tries the others again.
+// Reads pages of one bundle. Reports the pages that were read, and retries the pages
+// that failed.
 void PoolReaders::read_together(PoolShared& shared, uint32_t bundle,
                                 Span<PageReading> pages) const {
     policy_.source(bundle).read_pages(pages);

@@ -4,21 +4,21 @@
 
 namespace v3dg {
 
-// attempts to lock before a frame continues without the mutex
+// Attempts to lock before a frame continues without the mutex.
 constexpr int kSpins = 64;
 
 PoolShared::PoolShared(const PoolLimits& pool_limits, size_t num_slots)
     : limits(pool_limits),
       has_threads(pool_limits.num_threads > 0 && num_slots > 0),
       most_bytes_a_frame(pool_limits.most_bytes_a_frame),
-      // not 0 before the first view is decided about
+      // The number is not 0, so that pages count as missing until the pool has decided
+      // about the first view.
       missing(num_slots == 0 ? 0 : 1) {}
 
 void PoolShared::check_process() const {
     if (getpid() != process)
         throw std::runtime_error(
-            "memory: expected a renderer of this process, got one from before a fork; make "
-            "another");
+            "memory: this renderer is from before a fork; create a new one in this process");
 }
 
 void PoolShared::lock() {

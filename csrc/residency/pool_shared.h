@@ -14,7 +14,7 @@
 //
 // Annotations name the mutex of each field and function, and clang checks them
 // (.ci/check_threads.py). Functions take PoolShared as an argument, so that clang sees
-// that the mutex of the caller and that of the function are the same.
+// that the caller and the function use the same mutex.
 
 #include <sys/types.h>
 #include <unistd.h>
@@ -48,23 +48,23 @@ struct PoolShared {
     // Blocks and pages on their way. Readers take blocks and fill `read`. The decider
     // fills `todo` and `ready`. Frames take `ready` and give blocks back.
     PageBlocks blocks V3DG_GUARDED_BY(busy);
-    // the most urgent page is last
+    // The most urgent page is last.
     std::vector<PageRequest> todo V3DG_GUARDED_BY(busy);
     std::vector<LoadedPage> read V3DG_GUARDED_BY(busy);   // not seen by the decider yet
     std::vector<PageChange> ready V3DG_GUARDED_BY(busy);  // for the next frame
     size_t ready_bytes V3DG_GUARDED_BY(busy) = 0;
-    // number of pages that are being read
+    // Number of pages that are being read.
     size_t num_loading V3DG_GUARDED_BY(busy) = 0;
     bool lacks_blocks V3DG_GUARDED_BY(busy) = false;  // a reader found no free block
-    // Set if blocks were given back. The decider then wakes the readers, because that
-    // would take a frame too long.
+    // True if blocks were given back. The decider then wakes the readers. The frame
+    // does not wake them, because that would delay it.
     bool frees_readers V3DG_GUARDED_BY(busy) = false;
 
     // The page requests of a frame. Frames set `noted`; the decider moves it to
     // `free_needs`.
     FrameNeeds* noted V3DG_GUARDED_BY(busy) = nullptr;  // not decided about yet
     std::vector<FrameNeeds*> free_needs V3DG_GUARDED_BY(busy);
-    // the last view that was decided about
+    // The last view that the decider has processed.
     uint64_t decided_view V3DG_GUARDED_BY(busy) = 0;
     // Whether a view was noted since a frame last took `ready`.
     bool has_noted V3DG_GUARDED_BY(busy) = false;
@@ -72,11 +72,11 @@ struct PoolShared {
     // Decision rounds.
     uint64_t rounds_begun V3DG_GUARDED_BY(busy) = 0;
     uint64_t rounds_over V3DG_GUARDED_BY(busy) = 0;
-    // a thread waits for the next round
+    // A thread waits for the next round.
     bool wants_round V3DG_GUARDED_BY(busy) = false;
-    // that round ignores most_bytes_a_frame
+    // Whether the next round ignores most_bytes_a_frame.
     bool takes_all V3DG_GUARDED_BY(busy) = false;
-    // loaded pages that wait for a later frame
+    // Loaded pages that wait for a later frame.
     size_t num_left V3DG_GUARDED_BY(busy) = 0;
 
     // True if the threads must end.
@@ -87,15 +87,16 @@ struct PoolShared {
     std::string error V3DG_GUARDED_BY(busy);
     bool is_damage V3DG_GUARDED_BY(busy) = false;
 
-    // Any thread may read these without the mutex. The comments name the writers.
-    std::atomic<size_t> most_bytes_a_frame;  // the caller
-    std::atomic<size_t> needed{0};           // the decider
-    std::atomic<size_t> missing;             // the decider
-    std::atomic<size_t> failed{0};           // readers and forget_failures()
-    std::atomic<size_t> num_resident{0};     // frames; also the next two
+    // Any thread may read the fields below without the mutex. Their comments name the
+    // writers.
+    std::atomic<size_t> most_bytes_a_frame;  // written by the caller
+    std::atomic<size_t> needed{0};           // written by the decider
+    std::atomic<size_t> missing;             // written by the decider
+    std::atomic<size_t> failed{0};           // written by readers and forget_failures()
+    std::atomic<size_t> num_resident{0};     // written by frames, like the next two fields
     std::atomic<size_t> pages_in{0};
     std::atomic<size_t> bytes_in{0};
-    // the decider, or a caller that holds the mutex
+    // Written by the decider, or by a caller that holds the mutex.
     std::atomic<float> least_tolerance{0};
 
     // Throws std::runtime_error in a child of fork(). There the mutex could stay locked

@@ -12,13 +12,13 @@ namespace v3dg {
 
 struct PoolLimits {
     PoolMemory memory;
-    // slots have codes instead of rows; all pages must be coded
+    // Slots have codes instead of rows; all pages must be coded.
     bool keeps_codes = false;
-    // memory for pages that were read and are not resident yet
+    // Memory for pages that were read and are not resident yet.
     size_t block_bytes = size_t(64) << 20;
-    // bytes of pages that become resident per frame; can be changed later
+    // Bytes of pages that become resident per frame; can be changed later.
     size_t most_bytes_a_frame = size_t(32) << 20;
-    // number of frames that may hold memory for page requests at once
+    // Number of frames that may hold memory for page requests at once.
     size_t most_frames = 1;
     // The number of reading threads. 0: read_one() reads, and the calling threads
     // decide.
@@ -38,7 +38,7 @@ struct FrameNeeds {
 
 // The result of waiting for the decision about a view.
 struct NotedView {
-    // whether the pool has decided about this view, so that status() describes it
+    // Whether the pool has decided about this view, so that status() describes it.
     bool is_decided = false;
     size_t num_absent = 0;  // number of pages that the cut missed
 };

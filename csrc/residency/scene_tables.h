@@ -7,6 +7,7 @@
 
 #include "base/device.h"
 #include "residency/bundle_tables.h"
+#include "residency/environments.h"
 #include "residency/instance_table.h"
 
 namespace v3dg {
@@ -22,13 +23,23 @@ struct PoseSpan {
 struct SceneOnDevice {
     const BundleOnDevice* bundles;
     InstanceTable instances;
+    EnvironmentTable environments;
+};
+
+// The number of clusters that a warp tests together.
+constexpr size_t kClustersOfPart = 32 * kClustersOfBounds;
+
+// Bounds on what one camera sees of a scene: its instances, and the parts of
+// kClustersOfPart clusters of the instances' tables.
+struct SeenBounds {
+    size_t instances, parts;
 };
 
 // The bundles and instances of a scene, on the device that is current at construction.
 //
 // Work is enqueued on the stream that is passed, which must belong to the device. A
-// thread that enqueues work which reads the scene must hold lock(stream) meanwhile.
-// This orders the work of several threads and streams.
+// thread that enqueues work which reads the scene must hold lock(stream) meanwhile. The
+// lock orders the work of several threads and streams.
 class SceneTables {
   public:
     SceneTables() = default;
@@ -41,7 +52,8 @@ class SceneTables {
     // Replaces all instances. The caller must then call set_poses(), and may reuse host
     // memory on return. `factors` is empty if all are 1.
     void set_instances(Span<const int32_t> bundle, Span<const float> importance,
-                       Span<const InstanceFactors> factors, cudaStream_t stream);
+                       Span<const InstanceFactors> factors, const EnvironmentTable& environments,
+                       cudaStream_t stream);
     // Sets the poses of all instances. A component is in host memory, which the caller
     // may reuse on return, or in device memory, which must not change.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
@@ -54,22 +66,30 @@ class SceneTables {
     size_t num_bundles() const { return bundles_.size(); }
     size_t num_instances() const { return num_instances_; }
     const BundleTables& bundle(size_t b) const { return *bundles_[b]; }
-    size_t num_instances_of(size_t b) const { return num_instances_of_[b]; }
+
+    // Return the bounds for cameras that see all instances, and for cameras that belong
+    // to an environment.
+    const SeenBounds& seen_by_all() const { return seen_by_all_; }
+    const SeenBounds& seen_in_environment() const { return seen_in_environment_; }
 
     SceneOnDevice on_device() const;
     // Locks the scene for enqueuing work on a stream.
     StreamLock lock(cudaStream_t stream) const { return StreamLock(busy_, stream); }
 
   private:
+    void find_bounds(Span<const int32_t> bundle, const EnvironmentTable& environments);
+
     const int device_ = current_device();
     mutable StreamMutex busy_;
     std::vector<std::shared_ptr<const BundleTables>> bundles_;
-    std::vector<size_t> num_instances_of_;  // number of instances of each bundle
     size_t num_instances_ = 0;
     DeviceBuffer<BundleOnDevice> bundles_on_device_;
     DeviceBuffer<int32_t> bundle_;
     DeviceBuffer<float> importance_;
     DeviceBuffer<InstanceFactors> factors_;
+    DeviceBuffer<int32_t> environment_order_, environment_begin_;
+    size_t num_environment_begins_ = 0;
+    SeenBounds seen_by_all_{}, seen_in_environment_{};
     size_t num_factors_ = 0;
     DeviceBuffer<double> uploaded_[3];
     const double *position_ = nullptr, *quaternion_ = nullptr, *scale_ = nullptr;

@@ -42,8 +42,8 @@ V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const Instance
            (1.0f + kBoundMargin) * rule.tolerance_px2;
 }
 
-// The tolerances for which a bound must hold: that of the rule alone, or that of the
-// rule and all larger ones.
+// The tolerances for which a bound must hold: only the tolerance of the rule, or this
+// tolerance and all larger tolerances.
 enum class Tolerances { this_one, from_this_on };
 
 // Returns false only if none of the clusters is drawn at these tolerances. The bounds
@@ -66,7 +66,7 @@ struct ClusterRange {
 // x2 be the square of radius / distance. The solid angle is between pi x2 and kMostOfPi
 // x2 steradians.
 constexpr float kMostOfPi = 1.08f;
-// Limits of the test of whole runs. Outside of these, float32 may lose digits, or
+// Limits of the test of whole runs. Outside of the limits, float32 may lose digits, or
 // squares may overflow.
 constexpr float kLeastRunTolerance = 1e-20f, kLeastRunX2 = 1e-30f, kMostRunDistance = 1e18f;
 

@@ -55,13 +55,13 @@ constexpr uint32_t kNoBin = ~uint32_t(0);  // there is no earlier frame
 V3DG_HD inline uint64_t goal_of_budget(uint64_t budget) { return budget - budget / kHeadroomParts; }
 
 // Returns the tolerance of this frame. `least` is the first bin from which on no cut
-// exceeds the budget. `goal` is the same for the budget minus the headroom, or
-// kNumBudgetBins if there is no such bin. The result is never below bin `least`. `last`
-// is the bin of the earlier frame, and becomes the bin of this frame.
+// exceeds the budget. `goal` is the first bin from which on no cut exceeds the budget
+// minus the headroom, or kNumBudgetBins if there is none. The result is never below bin
+// `least`. `last` is the bin of the earlier frame, and becomes the bin of this frame.
 V3DG_HD inline float tolerance_of_budget(const SelectRule& rule, uint32_t least, uint32_t goal,
                                          uint32_t& last) {
     if (rule.pace == BudgetPace::at_once) return tolerance_of_bin(least, rule.tolerance_px2);
-    // the bin of the rule's tolerance, which no result is below
+    // The bin of the rule's tolerance, which is the lowest possible result.
     const uint32_t floor = bin_of_metric(rule.tolerance_px2, 0.0f);
     goal = max_of(floor, min_of(goal, kNumBudgetBins - 1));
     const uint32_t from = last == kNoBin ? goal : last,

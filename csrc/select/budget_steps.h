@@ -15,7 +15,7 @@ namespace v3dg {
 // are independent.
 class BudgetSteps {
   public:
-    // state of tolerance_of_budget(), if it is kept on the host
+    // State of tolerance_of_budget(), if it is kept on the host.
     uint32_t last_bin = kNoBin;
 
     // Returns the rule for the next picture. A changed scene must be a new object.

@@ -21,6 +21,7 @@
 
 #include "base/device_guard.h"
 #include "base/scan.cuh"
+#include "select/cut_kernel.cuh"
 #include "select/cut_parts.cuh"
 #include "select/cut_scratch.cuh"
 #include "select/draw_items.cuh"
@@ -42,9 +43,7 @@ struct Cut::Target {
 
 namespace {
 
-constexpr unsigned kCutBlocks = 4;  // resident blocks per multiprocessor
 constexpr unsigned kReportBlocks = 64;
-constexpr unsigned kPlaceBlocks = 12;  // resident blocks per multiprocessor
 
 __global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, Eyes eyes,
                              CameraSides* sides) {
@@ -63,48 +62,15 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
     rule.tolerance_px2 = round.least_tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i < pictures.count) images[i] = pictures.image[i];
-    const Placed placed = place_instance(scene, i, eyes, sides, rule, placements);
-    const unsigned num_parts = write_parts(scene, placed, block, i, scratch);
+    const size_t num_instances = scene.instances.scale.size;
+    const InstanceSlot slot{.is_taken = i < num_instances, .instance = i, .place = i, .image = 0};
+    const Placed placed = place_instance(scene, slot, eyes, sides, rule, placements);
+    const unsigned num_parts = write_parts(scene, placed, block, i, num_instances, scratch);
     if (block + 1 == gridDim.x && threadIdx.x == 0) *scratch.num_parts = num_parts;
 }
 
 __global__ void report_kernel(NeedList needs, SelectRule rule, const CutChoice* choice) {
     report_needs(needs, rule, choice);
-}
-
-// Tests and writes clusters; see the head of this file. `kTells`: the kernel records
-// which pages are needed.
-template <class Output, bool kTells>
-__global__ void __launch_bounds__(kCutThreads, kCutBlocks)
-    cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice,
-               const BudgetState* state, CutScratch scratch, CutScratch second_scratch,
-               NeedList needs, Output output) {
-    await_kernel_before();
-    if (state != nullptr && state->again != 0) scratch = second_scratch;
-    const unsigned num_parts = *scratch.num_parts, at_once = scratch.parts_at_once(num_parts);
-    const unsigned num_tickets = blocks_for(num_parts, at_once);
-    if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
-    if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
-    if (!Output::kFades) rule.fade = {};
-    // If there is a block for every ticket, each block takes at most one.
-    const bool is_enough = num_tickets <= gridDim.x;
-    if (is_enough && blockIdx.x >= num_tickets) return;
-    for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;
-         ticket = is_enough ? num_tickets : take_ticket(scratch.cut_ticket)) {
-        const unsigned warp = threadIdx.x / 32, p = ticket * at_once + warp;
-        LaneClusters mine{};
-        if (warp < at_once && p < num_parts) mine = clusters_of_lane(scene, scene.parts[p]);
-        const auto weigh = [&](const BundleOnDevice& bundle, const InstanceView& view, int32_t c) {
-            const ClusterTable& table = bundle.table;
-            const InstanceCut<AskedGroups> cut = cut_by_asking(table, view, rule);
-            if constexpr (kTells)
-                tell_need(cut, c, static_cast<uint32_t>(&bundle - scene.bundles), needs);
-            return cut.drawn_weight(c);
-        };
-        ask_clusters<Output::kFades>(scene, rule, Tolerances::this_one, mine, weigh);
-        write_clusters(mine, ticket, ticket + 1 == num_tickets, scratch.unit_state,
-                       scratch.count_state, output);
-    }
 }
 
 // One thread per instance.
@@ -128,7 +94,7 @@ __global__ void __launch_bounds__(kCutThreads)
     if (p < given.instance.size && scene.instances.is_drawn(given.instance[p])) {
         const int32_t i = given.instance[p];
         mine = {.bundle = &scene.bundles[scene.instances.bundle[i]],
-                .instance = static_cast<uint32_t>(i),
+                .place = static_cast<uint32_t>(i),
                 .first = static_cast<uint32_t>(given.cluster[p]),
                 .is_alone = false,
                 .are_tops = false,
@@ -140,15 +106,6 @@ __global__ void __launch_bounds__(kCutThreads)
     }
     write_clusters(mine, ticket, ticket + 1 == gridDim.x, scratch.unit_state, scratch.count_state,
                    output);
-}
-
-// Returns the number of parts of all instances' tables, if bounds exclude no cluster.
-size_t most_parts(const SceneTables& scene) {
-    size_t parts = 0;
-    for (size_t b = 0; b < scene.num_bundles(); ++b)
-        parts += scene.num_instances_of(b) *
-                 std::max(1u, blocks_for(scene.bundle(b).num_clusters(), kPartSize));
-    return parts;
 }
 
 template <class T>
@@ -175,7 +132,7 @@ template <class Output>
 void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
               const Target& target, const Output& output, Count* zeros, cudaStream_t stream,
               const PartlyResident* resident) {
-    const size_t count = scene.num_instances(), parts = most_parts(scene);
+    const size_t count = scene.num_instances(), parts = scene.seen_by_all().parts;
     const unsigned num_places = kCutBlocks * num_multiprocessors();
     const size_t num_tickets = std::max<size_t>(blocks_for(parts, kCutWarps), num_places);
     Count* states = states_.reserve(4 * num_tickets, stream);
@@ -185,6 +142,7 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
     const SceneOnDevice on_device = scene.on_device();
     const PlacedScene placed{.bundles = resident == nullptr ? on_device.bundles : resident->bundles,
                              .instances = on_device.instances,
+                             .bundle_of_place = on_device.instances.bundle.data,
                              .views = views_.reserve(count, stream),
                              .tops = tops_.reserve(count, stream),
                              .parts = parts_.reserve(parts, stream)};
@@ -256,6 +214,7 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, const Give
     const SceneOnDevice on_device = scene.on_device();
     const PlacedScene placed{.bundles = on_device.bundles,
                              .instances = on_device.instances,
+                             .bundle_of_place = on_device.instances.bundle.data,
                              .views = nullptr,
                              .tops = nullptr,
                              .parts = nullptr};
@@ -336,9 +295,9 @@ void Cut::select(const SceneTables& scene, const Eyes& eyes, const SelectRule& r
 }
 
 size_t Cut::bytes() const {
-    return sides_.bytes() + views_.bytes() + tops_.bytes() + parts_.bytes() + states_.bytes() +
-           zeros_.bytes() + budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() +
-           pair_weight_.bytes() + pairs_.bytes();
+    return sides_.bytes() + views_.bytes() + bundle_of_place_.bytes() + tops_.bytes() +
+           parts_.bytes() + states_.bytes() + zeros_.bytes() + budget_.bytes() +
+           pair_instance_.bytes() + pair_cluster_.bytes() + pair_weight_.bytes() + pairs_.bytes();
 }
 
 }  // namespace cuda

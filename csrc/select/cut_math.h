@@ -15,9 +15,9 @@
 namespace v3dg {
 
 // Returns whether the cut of an instance consists of the top clusters, each with weight
-// 1. Then it depends on no page. All top groups must be tested. The paper's footprint
-//    is excluded: it may decrease towards the root, so that a group below a top group
-//    is refined.
+// 1. Such a cut depends on no page. All top groups are tested. The paper's footprint is
+// excluded: it may decrease towards the root, so that a group below a fitting top group
+// may be refined.
 V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view,
                              const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
@@ -26,10 +26,10 @@ V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view
     return true;
 }
 
-// The clusters among which the cut of an instance is.
+// The clusters that the cut of an instance can contain.
 enum class CutSource {
     nowhere,  // none: the instance is hidden
-    tops,     // the top clusters: those that no group replaces
+    tops,     // the top clusters, which no group replaces
     table,    // all clusters of the table
 };
 
@@ -48,7 +48,7 @@ V3DG_HD inline CutSource source_of_cut(const ClusterTable& table, const Instance
     return has_few_tops && tops_fit(table, view, rule) ? CutSource::tops : CutSource::table;
 }
 
-// A range of bins: those whose cuts contain a certain cluster.
+// A range of bins whose cuts contain a certain cluster.
 struct BinRange {
     uint32_t first, end;
 
@@ -90,8 +90,9 @@ struct InstanceCut {
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
 
-    // Returns the weight of a cluster before culling, in units of 1 / kWhole: the
-    // refinement of its parent group minus that of its own group (select_math.h).
+    // Returns the weight of a cluster before culling, in units of 1 / kWhole. The
+    // weight is the refinement of its parent group minus the refinement of its own
+    // group (select_math.h).
     V3DG_HD int32_t weight(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const int32_t below = own < 0 ? 0 : groups.refinement(own);

@@ -11,32 +11,37 @@ namespace cuda {
 
 using Count = unsigned long long;
 
-// clusters per lane in a part of a table
+// Clusters per lane in a part of a table.
 constexpr unsigned kLaneClusters = kClustersOfBounds;
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
-static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
+static_assert(kLaneClusters == 8, "a byte has one bit per cluster of a lane");
+static_assert(kPartSize == kClustersOfPart, "scenes bound the number of parts");
 
 // The work of one warp. If `lanes` is 0, the part is clusters [first, first +
 // kPartSize) of one instance. Otherwise each set bit k of `lanes` means that lane k
-// processes instance + k: its top clusters, or the last clusters of its table.
+// processes the instance at place + k: its top clusters, or the last clusters of its
+// table.
 struct CutPart {
-    uint32_t instance, first, lanes;
+    uint32_t place, first, lanes;
 };
 
-// Returns the index of the first of a table's last clusters: the coarsest ones, which a
-// single lane can test.
+// Returns where the last clusters of a table begin: the coarsest ones, which are few
+// enough for one lane to test.
 __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene, and what place_kernel writes about its instances.
+// A scene, and what place_kernel writes about its instances. With one viewpoint, the
+// place of an instance is its index. A batch has a place for each instance of each
+// camera.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
+    const int32_t* bundle_of_place;
     InstanceView* views;  // set for instances whose tables are tested
-    // For an instance that a single lane processes: one bit per drawn top cluster; or 0
-    // if the lane tests the last clusters of the table.
+    // One byte per instance that a single lane processes: one bit per drawn top
+    // cluster, or 0 if the lane tests the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
@@ -83,16 +88,18 @@ struct alignas(16) LaneWeights {
         return static_cast<int32_t>((k < 4 ? low : high) >> 16 * (k % 4) & 0xffff);
     }
 };
-static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
+static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "LaneWeights holds eight weights of 16 bits");
 
 // The clusters of a part that one lane processes. All belong to one instance. Bit k of
 // `drawn` is set if the k-th cluster is drawn. Weights are set only in cuts with a
 // fade.
 struct LaneClusters {
     const BundleOnDevice* bundle;
-    uint32_t instance;
+    uint32_t place;  // place of the instance
     uint32_t first;  // index of the first cluster in the table
-    bool is_alone;   // each lane has another instance; else the warp has a single one
+    // True if each lane has its own instance; false if all lanes have the same
+    // instance.
+    bool is_alone;
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -113,7 +120,7 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     const unsigned lane = threadIdx.x % 32;
     const bool is_alone = part.lanes != 0;
     LaneClusters mine{.bundle = nullptr,
-                      .instance = part.instance,
+                      .place = part.place,
                       .first = part.first + kLaneClusters * lane,
                       .is_alone = is_alone,
                       .are_tops = false,
@@ -121,12 +128,12 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
                       .weights = {}};
     if (is_alone) {
         if ((part.lanes >> lane & 1) == 0) return mine;
-        mine.instance += lane;
-        mine.drawn = scene.tops[mine.instance];
+        mine.place += lane;
+        mine.drawn = scene.tops[mine.place];
         mine.are_tops = mine.drawn != 0;
         mine.weights = LaneWeights::all(kWhole);
     }
-    mine.bundle = &scene.bundles[scene.instances.bundle[mine.instance]];
+    mine.bundle = &scene.bundles[scene.bundle_of_place[mine.place]];
     if (is_alone && !mine.are_tops) mine.first = last_of_table(mine.bundle->table);
     return mine;
 }
@@ -134,7 +141,7 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
 // Tests the clusters of a block's parts that come from tables. All threads of the block
 // must call it. A lane is an owner if the bounds of its clusters do not exclude all of
 // them. The warps share the tests of all owners, a lane per cluster and four owners at
-// a time, so that no warp waits long for one with more owners.
+// a time, so that no warp waits long for a warp with more owners.
 //
 // Sets bit k of an owner's `drawn` if ask(bundle, view, cluster) is positive for its
 // k-th cluster. With `kKeepsWeights`, it also stores the values in `weights`.
@@ -143,7 +150,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
         const BundleOnDevice* bundle;  // null if each lane has another instance
-        // first cluster; if `bundle` is null, instance of the first lane
+        // First cluster; if `bundle` is null, place of the instance of the first lane.
         uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];
@@ -152,21 +159,21 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
     __shared__ uint8_t owners[kCutThreads];  // indices of threads that own clusters
     __shared__ uint8_t drawn[kCutThreads];   // [thread] one bit per drawn cluster
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
-    static_assert(kCutThreads <= 256, "a byte says which thread");
+    static_assert(kCutThreads <= 256, "`owners` stores the index of a thread in a byte");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
-    // the condition is equal in all lanes of the warp
+    // The condition is equal in all lanes of the warp.
     if (!mine.is_alone && mine.bundle != nullptr) {
-        const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
+        const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.place);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
             reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
         if (lane == 0) tables[warp] = {mine.bundle, mine.first};
     }
-    if (mine.is_alone && lane == 0) tables[warp] = {nullptr, mine.instance};
+    if (mine.is_alone && lane == 0) tables[warp] = {nullptr, mine.place};
     __syncwarp();
     if (mine.bundle != nullptr && !mine.are_tops) {
         const ClusterTable& table = mine.bundle->table;
-        const InstanceView& view = mine.is_alone ? scene.views[mine.instance] : views[warp];
+        const InstanceView& view = mine.is_alone ? scene.views[mine.place] : views[warp];
         is_owner = mine.first < table.num_clusters() &&
                    may_draw(table, mine.bounds(), view, rule, tolerances);
     }
@@ -190,11 +197,11 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
         if (is_one) {
             const Table& of = tables[owner / 32];
             const bool is_alone = of.bundle == nullptr;
-            // used only if the owner's lane has its own instance
-            const uint32_t instance = of.first + owner % 32;
+            // `lane_place` is used only if the owner's lane has its own instance.
+            const uint32_t lane_place = of.first + owner % 32;
             const BundleOnDevice* bundle =
-                is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;
-            const InstanceView& view = is_alone ? scene.views[instance] : views[owner / 32];
+                is_alone ? &scene.bundles[scene.bundle_of_place[lane_place]] : of.bundle;
+            const InstanceView& view = is_alone ? scene.views[lane_place] : views[owner / 32];
             const uint32_t c = k + (is_alone ? last_of_table(bundle->table)
                                              : of.first + kLaneClusters * (owner % 32));
             if (c < bundle->table.num_clusters())

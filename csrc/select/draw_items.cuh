@@ -1,14 +1,14 @@
 #pragma once
 
 // The output lists of a cut: pairs, or the items of a frame. A lane counts its elements
-// first. It writes them after a prefix sum over all lanes has given their position.
+// first. A prefix sum over all lanes then gives the position at which it writes them.
 
 #include "select/cut_parts.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// What a lane will write.
+// The amount that a lane will write.
 struct WriteCount {
     unsigned units, gaussians;  // `units`: number of list elements
 };
@@ -35,7 +35,7 @@ struct PairOutput {
         for (unsigned k = 0; k < kLaneClusters; ++k)
             if (mine.drawn >> k & 1) {
                 if (first >= capacity) return;
-                instance[first] = static_cast<int32_t>(mine.instance);
+                instance[first] = static_cast<int32_t>(mine.place);
                 if (kFades) weight[first] = share_of(mine.weights[k]);
                 cluster[first++] = mine.cluster(k);
             }
@@ -85,7 +85,8 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
         }
         return;
     }
-    static_assert(alignof(BundleOnDevice) > 1, "a bit of its address is free");
+    static_assert(alignof(BundleOnDevice) > 1,
+                  "the lowest bit of the address must be 0, because are_tops uses it");
     const auto same_clusters = reinterpret_cast<unsigned long long>(mine.bundle) | mine.are_tops;
     const unsigned same = __match_any_sync(kAllLanes, same_clusters);
     for (unsigned k = 0; __any_sync(kAllLanes, mine.drawn >> k != 0); ++k) {
@@ -120,12 +121,13 @@ struct ItemOutput {
     }
     __device__ void write(const LaneClusters& mine, Count first, Count record) const {
         for_each_drawn<kFades>(mine, [&](const DrawnRun& run) {
-            static_assert(kLaneClusters <= kItemClusters, "a run may be as long");
+            static_assert(kLaneClusters <= kItemClusters,
+                          "all clusters of a lane may be in one item");
             const int32_t cluster = mine.cluster(run.k);
             const unsigned size = mine.size(run.k, run.num_clusters),
                            step = run.gaussians_an_item();
             const uint32_t placement =
-                run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
+                run.sharers == 0 ? mine.place : mine.place - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
             const uint32_t place = mine.bundle->table.place_of(cluster);
             const ClusterAppearance& appearances = mine.bundle->appearance;

@@ -41,10 +41,11 @@ V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
 }
 
 // Returns how far the page of a group has faded in, from 0 to kWhole. The refinement of
-// the group is limited to this. Neither value decreases towards the root, so their
-// minimum does not either, and the cut stays exact.
+// the group is limited to this value. Neither the refinement nor this value decreases
+// towards the root, so their minimum does not decrease either, and the cut stays exact.
 V3DG_HD inline int32_t arrival(const PageTable& pages, int32_t g, const SelectRule& rule) {
-    static_assert(kWhole % kArrivalFrames == 0, "frames are whole parts");
+    static_assert(kWhole % kArrivalFrames == 0,
+                  "kWhole must be a multiple of the number of frames");
     return rule.fade.is_on() ? pages.arrived(g, rule.frame) * (kWhole / kArrivalFrames) : kWhole;
 }
 

@@ -36,8 +36,8 @@ V3DG_HD inline float footprint_at(float radius, float distance2, const InstanceV
     return x2 < 1.0f ? area : INFINITY;
 }
 
-// Returns the screen area, px², that a ball covers. Infinite if the eye is inside the
-// ball, or if the result would be NaN.
+// Returns the screen area, px², that a ball covers. The area is infinite if the eye is
+// inside the ball, or if the result would be NaN.
 V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view,
                                    Footprint footprint) {
     if (footprint == Footprint::solid_angle)

@@ -14,7 +14,8 @@ namespace v3dg {
 // normal.
 struct PlaneSide {
     float nearest, farthest;  // signed distances of the nearest and farthest corner
-    // how far gaussians may extend beyond the box, plus a margin for rounding errors
+    // The distance by which gaussians may extend beyond the box, plus a margin for
+    // rounding.
     float reach;
 };
 

@@ -34,7 +34,7 @@ V3DG_HD inline CameraSides sides_of_eyes(const Eyes& eyes, double pad_px) {
 }
 
 // Transforms the camera into the coordinates of an instance. `in` are the axes of the
-// first eye; `sides` belong to the instance's bundle. This is compiled without
+// first eye; `sides` belong to the instance's bundle. The function is compiled without
 // floating-point contraction, so that the CPU and CUDA compute the same bits.
 V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const CameraSides& sides,
                                                const InstanceAxes& in, const Pose& pose,

@@ -1,7 +1,7 @@
 #pragma once
 
-// Finds the pages that a cut needs, and their priorities. Used when only some pages of
-// a bundle are resident.
+// Finds the pages that a cut needs, and their priorities. The functions are used when
+// only some pages of a bundle are resident.
 
 #include <cfloat>
 #include <cmath>
@@ -14,13 +14,15 @@
 namespace v3dg {
 
 // Returns the priority of a group's page. It is above 1 if the cut would refine the
-// group, and at most 1 if only a cut with a smaller tolerance would. A fade raises it.
+// group, and at most 1 if only a cut with a smaller tolerance would refine it. A fade
+// raises the priority.
 V3DG_HD inline float priority_of(float metric_px2, const SelectRule& rule) {
     const float ratio = metric_px2 * rule.fade.factor / rule.tolerance_px2;
     if (fits(metric_px2, rule)) return ratio <= 1.0f ? ratio : 0.0f;
     return ratio > 1.0f ? ratio : 1.0f + FLT_EPSILON;
 }
-// Pages with at least this priority are requested, which is before they are needed.
+// Pages with at least this priority are requested. A page that the cut needs now has a
+// priority above 1, so pages are requested before the cut needs them.
 constexpr float kLeastPriority = 0.5f;
 
 // A page that a cut needs.

@@ -21,19 +21,18 @@ struct BundleSides {
     CameraSides few[kFewBundles];
     const CameraSides* many;  // null if `few` is used
 
-    __device__ CameraSides operator[](size_t bundle) const {
+    __device__ CameraSides operator()(size_t bundle) const {
         if (many != nullptr) return many[bundle];
         return few[bundle];
     }
 };
 
-// Returns the placement of an instance in front of an eye. With n instances, instance i
-// has the index eye * n + i among the placements.
+// Returns the placement of an instance in front of the camera of an image.
 __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& pose, int32_t bundle,
-                                         unsigned eye) {
+                                         unsigned image) {
     return {.view = model_view_from_instance(axes, pose),
             .model = static_cast<uint32_t>(bundle),
-            .image = eye};
+            .image = image};
 }
 
 // One record per lane of a warp, in shared memory, so that the warp writes them to
@@ -48,7 +47,7 @@ struct RecordRow {
     __device__ void write(bool has_one, Record* first) const {
         constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
         static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
-                      "records are whole vectors");
+                      "records are copied as vectors of 16 bytes");
         const unsigned writers = __ballot_sync(kAllLanes, has_one);
         __syncwarp();
         if (writers == 0) return;
@@ -70,18 +69,29 @@ struct Placed {
     bool is_alone;       // whether a single lane tests these clusters
 };
 
-// Places instance i, if it exists: writes its view, its placements and its drawn top
-// clusters. All lanes of the warp must call it, with consecutive instances.
-__device__ inline Placed place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
-                                        const BundleSides& sides, const SelectRule& rule,
-                                        Placement* placements) {
+// The instance of a thread.
+struct InstanceSlot {
+    bool is_taken;    // whether the thread has an instance
+    size_t instance;  // index of the instance in the scene
+    size_t place;     // where the results are written; consecutive in a warp
+    unsigned image;   // image of the first eye
+};
+
+// Places an instance: writes its view, its placements and its top clusters. All lanes
+// of the warp must call it. `sides_of` returns the frustum sides for a bundle. With n
+// instances, instance i has the placement n + i in front of a second eye.
+template <class SidesOf>
+__device__ inline Placed place_instance(const PlacedScene& scene, const InstanceSlot& slot,
+                                        const Eyes& eyes, const SidesOf& sides_of,
+                                        const SelectRule& rule, Placement* placements) {
     __shared__ InstanceView space[kPlaceThreads];
-    static_assert(sizeof(Placement) <= sizeof(InstanceView), "rows of both use the same memory");
+    static_assert(sizeof(Placement) <= sizeof(InstanceView),
+                  "placements are stored in the memory of views");
     InstanceView* of_warp = space + threadIdx.x / 32 * 32;
     const RecordRow<Placement> placement_row{reinterpret_cast<Placement*>(of_warp)};
     const RecordRow<InstanceView> view_row{of_warp};
-    const size_t num_instances = scene.instances.scale.size, first = i - threadIdx.x % 32;
-    const Pose pose = i < num_instances
+    const size_t i = slot.instance, first = slot.place - threadIdx.x % 32;
+    const Pose pose = slot.is_taken
                           ? scene.instances.pose(i)
                           : Pose{.position = nullptr, .quaternion = nullptr, .scale = 0.0};
     CutSource source = CutSource::nowhere;
@@ -89,16 +99,17 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     bool is_alone = false;
     int32_t bundle = 0;
     InstanceView view;
-    if (i < num_instances && scene.instances.is_drawn(i)) {
+    if (slot.is_taken && scene.instances.is_drawn(i)) {
         bundle = scene.instances.bundle[i];
         const ClusterTable& table = scene.bundles[bundle].table;
         {
             const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
-            view =
-                view_from_instance(eyes, sides[bundle], axes, pose, scene.instances.importance[i]);
+            view = view_from_instance(eyes, sides_of(bundle), axes, pose,
+                                      scene.instances.importance[i]);
             // Store the placement now, before it is known whether the instance is
             // visible. Then its axes need no registers any more.
-            if (placements != nullptr) placement_row.set(placement_of(axes, pose, bundle, 0));
+            if (placements != nullptr)
+                placement_row.set(placement_of(axes, pose, bundle, slot.image));
         }
         source = source_of_cut(table, view, rule, kLaneClusters);
         if (source == CutSource::tops) {
@@ -106,7 +117,7 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
             unsigned drawn = 0;
             for (unsigned k = 0; k < table.top_cluster.size; ++k)
                 if (!cut.is_culled(table.top_cluster[k])) drawn |= 1u << k;
-            scene.tops[i] = static_cast<uint8_t>(drawn);
+            scene.tops[slot.place] = static_cast<uint8_t>(drawn);
             if (drawn == 0) source = CutSource::nowhere;
         }
         // With a budget, the tolerance is not known yet, so the bounds must hold for
@@ -116,7 +127,7 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
                 table, scene.bundles[bundle].runs, view, rule,
                 rule.budget == kNoBudget ? Tolerances::this_one : Tolerances::from_this_on);
             is_alone = asked.first < asked.end && asked.first >= last_of_table(table);
-            if (is_alone) scene.tops[i] = 0;
+            if (is_alone) scene.tops[slot.place] = 0;
         }
         is_alone |= source == CutSource::tops;
     }
@@ -127,7 +138,7 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
             if (is_seen)
                 placement_row.set(
                     placement_of(axes_of_instance(eyes.camera[1], pose), pose, bundle, 1));
-            placement_row.write(is_seen, placements + num_instances + first);
+            placement_row.write(is_seen, placements + scene.instances.scale.size + first);
         }
     }
     if (source == CutSource::table) view_row.set(view);
@@ -135,21 +146,23 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     return {.source = source, .asked = asked, .is_alone = is_alone};
 }
 
-// Writes the parts of a block's instances behind those of earlier blocks, and clears
-// the states of cut_kernel. All threads of the block must call it. Returns the number
-// of parts up to and including this block.
+// Writes the parts of a block's instances behind the parts of earlier blocks, and
+// clears the states of cut_kernel. All threads of the block must call it. Returns the
+// number of parts up to and including this block.
 //
-// Consecutive instances that a single lane each can process form one part, unless an
-// instance with a full table is between them. The thread of the first instance writes
-// it.
+// Consecutive instances form one part if a single lane can process each of them, unless
+// an instance with a full table is between them. The thread of the first instance
+// writes the part. `place` is the place of the thread's instance. `num_instances` is
+// the number of instances of its viewpoint.
 __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
-                                       size_t i, const CutScratch& scratch) {
+                                       size_t place, size_t num_instances,
+                                       const CutScratch& scratch) {
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
     const unsigned lanes = __ballot_sync(kAllLanes, placed.is_alone);
     const unsigned tables =
         __ballot_sync(kAllLanes, placed.source == CutSource::table && !placed.is_alone);
     const unsigned table_below = tables & below, table_above = tables & ~below;
-    const unsigned width = scene.instances.scale.size <= kFewInstances ? kFewLanes : 32;
+    const unsigned width = num_instances <= kFewInstances ? kFewLanes : 32;
     const unsigned first = lane / width * width;
     const unsigned from =
         max(first, table_below != 0 ? 32 - __clz(static_cast<int>(table_below)) : 0);
@@ -172,22 +185,22 @@ __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& p
     if (begins) {
         const unsigned until = to < 32 ? (1u << to) - 1 : kAllLanes;
         *part = {
-            .instance = static_cast<uint32_t>(i), .first = 0, .lanes = (lanes & until) >> lane};
+            .place = static_cast<uint32_t>(place), .first = 0, .lanes = (lanes & until) >> lane};
     } else if (!placed.is_alone) {
         for (unsigned p = 0; p < parts; ++p)
-            part[p] = {.instance = static_cast<uint32_t>(i),
+            part[p] = {.place = static_cast<uint32_t>(place),
                        .first = placed.asked.first + p * kPartSize,
                        .lanes = 0};
     }
-    // Clear the states of all tickets that cut_kernel may use. If tickets have
-    // kCutWarps parts, each block clears the tickets that begin with one of its parts.
-    // If tickets have fewer, there are at most num_places tickets, which all blocks
-    // clear together.
+    // Clear the states of all tickets that cut_kernel may use. If a ticket has
+    // kCutWarps parts, each block clears the tickets whose first part belongs to the
+    // block. If a ticket has fewer parts, there are at most num_places tickets, and all
+    // blocks together clear them.
     const auto clear = [&](unsigned first, unsigned end, unsigned step) {
         for (unsigned t = first; t < end; t += step)
             scratch.unit_state[t] = scratch.count_state[t] = 0;
     };
-    clear(static_cast<unsigned>(i), scratch.num_places, gridDim.x * kPlaceThreads);
+    clear(static_cast<unsigned>(place), scratch.num_places, gridDim.x * kPlaceThreads);
     clear(blocks_for(before, kCutWarps) + threadIdx.x, blocks_for(before + total, kCutWarps),
           kPlaceThreads);
     return before + total;

@@ -10,7 +10,7 @@ namespace v3dg {
 
 // The measure of a ball's screen area.
 enum class Footprint {
-    // the ball's solid angle, which does not change when the camera rotates
+    // The ball's solid angle, which does not change when the camera rotates.
     solid_angle,
     paper,  // pi r² fx fy / depth², only for pinholes (Yang et al., SIGGRAPH 2025)
 };
@@ -29,13 +29,13 @@ struct Fade {
     }
 };
 
-// How a budget determines the tolerance.
+// The way in which a budget determines the tolerance.
 enum class BudgetPace {
     at_once,  // from the current view alone
-    // from the current view and the tolerance of the last frame, so that slow motion
-    // causes no sudden change (budget_steps.h)
+    // Choose from the current view and the tolerance of the last frame, so that slow
+    // motion causes no sudden change (budget_steps.h).
     in_steps,
-    // for drawing a frame again: keeps the tolerance, unless the cut exceeds the budget
+    // Keep the tolerance unless the cut exceeds the budget; for drawing a frame again.
     again,
 };
 
@@ -45,13 +45,15 @@ struct SelectRule {
     Footprint footprint = Footprint::solid_angle;
     bool culls = true;      // leave out clusters that are outside of the frustum
     int32_t min_level = 0;  // finer levels are not drawn
-    // largest number of gaussians; the tolerance is raised until the cut has no more
+    // Largest number of gaussians; the tolerance is raised until the cut has no more.
     uint64_t budget = kNoBudget;
     BudgetPace pace = BudgetPace::at_once;
-    // for in_steps: number of frames without motion, including this one
+    // The number of frames without motion, including this one; for
+    // BudgetPace::in_steps.
     int32_t frames_at_rest = 0;
     Fade fade = {};  // must be off with Footprint::paper
-    // with a fade: index of the frame, which determines how far pages have faded in
+    // The index of the frame, which determines how far pages have faded in; for cuts
+    // with a fade.
     int32_t frame = 0;
 
     bool operator==(const SelectRule& o) const {

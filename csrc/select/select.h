@@ -24,11 +24,11 @@ namespace v3dg {
 // With a budget, the tolerance is the first bin (budget_math.h) from which on no cut
 // has more gaussians than the budget. Checking all larger bins is necessary: a coarser
 // cut can have more gaussians inside the frustum. If there is no such bin,
-// `fits_budget` is false, nothing is selected, and `num_gaussians` is that of the
-// coarsest cut. The budget assumes that all pages are resident; otherwise the cut may
-// have more or fewer gaussians. With a fade, every cluster that may be drawn counts.
-// With BudgetPace::in_steps, the tolerance also depends on that of the last frame, and
-// is at least that bin.
+// `fits_budget` is false, nothing is selected, and `num_gaussians` counts the coarsest
+// cut. The budget assumes that all pages are resident; otherwise the cut may have more
+// or fewer gaussians. With a fade, every cluster that may be drawn counts. With
+// BudgetPace::in_steps, the tolerance also depends on the tolerance of the last frame,
+// and is at least the first bin.
 //
 // With a fade, a path may have several clusters, whose weights add up to 1. A weight
 // depends on the metrics of two groups, and on how far their pages have faded in.
@@ -44,8 +44,11 @@ struct SelectInput {
     // the highest priority of each page (page_need.h). Must be 0 initially; 0 means
     // that the page is not needed. An empty span requests nothing.
     Span<const Span<uint32_t>> needs = {};
-    // state of tolerance_of_budget(), for BudgetPace::in_steps
+    // State of tolerance_of_budget(), for BudgetPace::in_steps.
     uint32_t* last_bin = nullptr;
+    // The result of runs_of_bundles(), for callers that select many cuts. If empty,
+    // each cut computes the runs.
+    Span<const ClusterRuns> runs = {};
 };
 
 struct SelectOutput {
@@ -71,15 +74,20 @@ struct BudgetCut {
     int64_t num_gaussians;  // with all pages resident; of the coarsest cut if none fits
 };
 
+// Returns the runs of each bundle for `num_cuts` cuts. The runs of a bundle are empty
+// if it has few instances in all cuts together.
+std::vector<ClusterRuns> runs_of_bundles(Span<const ClusterTable> bundles,
+                                         const InstanceTable& instances, size_t num_cuts);
+
 namespace cpu {
 void select(const SelectInput& in, SelectOutput& out);
 
-// Finds the tolerances for several budgets in one view. Each result is that of select()
-// with this budget. The cost is hardly higher than for one budget.
+// Finds the tolerances for several budgets in one view. Each result is the result of
+// select() with that budget. The cost is hardly higher than for one budget.
 void choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets, Span<BudgetCut> chosen);
 
-// Computes the metrics, px², of all groups of all instances. Those of instance i begin
-// at metric_offset[i].
+// Computes the metrics, px², of all groups of all instances. The metrics of instance i
+// begin at metric_offset[i].
 void group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric);
 
 // Computes, for each pair, the metric, px², of the group that made the cluster; 0 for

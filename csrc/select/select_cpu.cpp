@@ -17,8 +17,8 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
-// The number of instances from which on the runs of a bundle are computed. That costs
-// about as much as processing one instance.
+// The number of instances from which on the runs of a bundle are computed. Computing
+// the runs costs about as much as processing one instance.
 constexpr size_t kManyInstances = 16;
 
 // Stored states of the groups of one instance: how far each group is refined, and its
@@ -42,8 +42,9 @@ struct KnownBins {
 struct View {
     const SelectInput& in;
     std::vector<CameraSides> sides;  // one per bundle
-    // one per bundle, set by find_runs(); empty if there are few instances
-    std::vector<ClusterRuns> runs;
+    std::vector<ClusterRuns> own_runs;
+    // One per bundle, set by find_runs(); empty if there are few instances.
+    Span<const ClusterRuns> runs;
     size_t most_groups = 0, most_clusters = 0;  // largest numbers in any bundle
 
     explicit View(const SelectInput& input) : in(input) {
@@ -55,12 +56,9 @@ struct View {
     }
 
     void find_runs() {
-        std::vector<size_t> count(in.bundles.size, 0);
-        for (const int32_t b : in.instances.bundle) ++count[b];
-        runs.resize(in.bundles.size);
-        parallel_for(runs.size(), 1, [&](size_t b) {
-            if (count[b] >= kManyInstances) runs[b] = runs_of_clusters(in.bundles[b]);
-        });
+        if (in.runs.empty()) own_runs = runs_of_bundles(in.bundles, in.instances, 1);
+        runs = in.runs;
+        if (in.runs.empty()) runs = {own_runs.data(), own_runs.size()};
     }
 };
 
@@ -108,8 +106,8 @@ struct SeenInstance {
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
-        // Most clusters belong to most groups. Finding their range would cost more than
-        // testing all groups.
+        // If most clusters must be tested, they belong to most groups. Then finding the
+        // range of these groups would cost more than testing all groups.
         if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
         int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
         for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
@@ -137,8 +135,8 @@ struct Scratch {
 
 // Computes the refinement of an instance's groups. Passing the inputs by value shows
 // the compiler that no write changes them, so it vectorises the first loop. Tests of
-// residency would prevent that. So a second loop handles groups whose page is absent or
-// fading in.
+// residency would prevent vectorisation. So a second loop handles groups whose page is
+// absent or fading in.
 template <Footprint footprint, bool kFades>
 void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
                 const ClusterRange asked, uint16_t* __restrict refinement) {
@@ -173,7 +171,7 @@ size_t find_sufficient(const ClusterTable table, const InstanceView view, const 
                        int32_t* __restrict cluster) {
     const InstanceCut<KnownRefinements> cut{table, view, rule, {refinement}, false};
     size_t num_sufficient = 0;
-    // Without a branch, because it would be mispredicted often.
+    // The loop has no branch, because the branch would often be mispredicted.
     for (size_t c = asked.first; c < asked.end; ++c) {
         cluster[num_sufficient] = static_cast<int32_t>(c);
         num_sufficient += cut.weight(c) > 0;
@@ -263,8 +261,8 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
     }
 }
 
-// For each bin, by how many gaussians its cut differs from the cut of the preceding
-// bin. Several arrays, which must be added.
+// Several arrays whose sum is, for each bin, by how many gaussians its cut differs from
+// the cut of the preceding bin.
 using BinChanges = std::vector<std::vector<int64_t>>;
 BinChanges count_changes(const View& view) {
     const size_t num_instances = view.in.instances.bundle.size;
@@ -298,6 +296,17 @@ bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
 }
 
 }  // namespace
+
+std::vector<ClusterRuns> runs_of_bundles(Span<const ClusterTable> bundles,
+                                         const InstanceTable& instances, size_t num_cuts) {
+    std::vector<size_t> count(bundles.size, 0);
+    for (const int32_t b : instances.bundle) count[b] += num_cuts;
+    std::vector<ClusterRuns> runs(bundles.size);
+    parallel_for(runs.size(), 1, [&](size_t b) {
+        if (count[b] >= kManyInstances) runs[b] = runs_of_clusters(bundles[b]);
+    });
+    return runs;
+}
 
 void cpu::select(const SelectInput& in, SelectOutput& out) {
     View view(in);
@@ -340,7 +349,7 @@ void cpu::choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets,
     View view(in);
     view.find_runs();
     const BinChanges changes = count_changes(view);
-    // A step is a bin at which the number of gaussians changes. There are few.
+    // A step is a bin at which the number of gaussians changes. There are few steps.
     struct Step {
         uint32_t bin;
         int64_t count;

@@ -134,9 +134,9 @@ __device__ void sort_pairs(const Scratch& group, int n) {
     }
 }
 
-// Chooses at most `allowed` of the sorted pairs: those that share no node with an
-// earlier chosen pair. Moves them to the front of `pairs`, and returns their number.
-// One warp calls it.
+// Chooses at most `allowed` of the sorted pairs. A pair is chosen if it shares no node
+// with an earlier chosen pair. Moves the chosen pairs to the front of `pairs`, and
+// returns their number. One warp calls it.
 __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int chosen = 0;

@@ -17,7 +17,8 @@ namespace v3dg {
 // Returns the importance of a gaussian for pruning: the cube of opacity * (s1 s2
 // s3)^(2/3) (V3DG, section 3.2: product of scale and opacity). The cube has the same
 // order, but needs no roots, whose last bits differ between libraries. Squared volumes
-// of float32 scales do not overflow float64. Those that underflow are invisibly small.
+// of float32 scales do not overflow float64. A gaussian whose volume underflows is too
+// small to be visible.
 V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     const double volume = static_cast<double>(scale[0]) * scale[1] * scale[2];
     const double o = opacity;
@@ -35,12 +36,12 @@ V3DG_HD inline int octant_of(const float mean[3], const float median[3]) {
     return 4 * (mean[0] >= median[0]) + 2 * (mean[1] >= median[1]) + (mean[2] >= median[2]);
 }
 
-// Returns the rank of the median of `count` values; of two in the middle, the lower
-// one.
+// Returns the rank of the median of `count` values. If two values are in the middle,
+// the lower rank is returned.
 V3DG_HD inline int64_t median_rank(int64_t count) { return (count - 1) / 2; }
 
 // Returns how many gaussians of an octant are kept, if a group of `count` keeps
-// `wanted`. The octant has `num_here` gaussians, the octants before it have
+// `wanted`. The octant has `num_here` gaussians, and the octants before it have
 // `num_before`. The results of all octants add up to `wanted`.
 V3DG_HD inline int64_t octant_share(int64_t num_before, int64_t num_here, int64_t count,
                                     int64_t wanted) {

@@ -44,11 +44,12 @@ struct TileLists {
     struct Chunk {
         uint64_t first, count;
         uint32_t least_depth, most_depth;  // range of the bits of the records' depths
-        // In the chunk's format: the index of the record in the chunk, and all depth
+        // The entries of the chunk: the index of the record in the chunk, and all depth
         // bits.
         Buffer<uint64_t> entry;
     };
-    // [chunk][tile + 1] first entry of the tile in the chunk
+    // For each chunk, the first entry of each tile in the chunk, and the end:
+    // [num_chunks][num_tiles + 1].
     Buffer<uint32_t> chunk_offset;
     std::vector<Chunk> chunk;
 
@@ -83,7 +84,7 @@ namespace cuda {
 // The input of tile_bin(), in device memory.
 struct TileBinInput {
     const ItemTiles* items;
-    // the tiles of each record; kManyTiles for records that are in `large`
+    // The tiles of each record; kManyTiles for records that are in `large`.
     const FewTiles* few;
     RecordPlanes records;
     const FrameImage* images;
@@ -91,8 +92,8 @@ struct TileBinInput {
     Capacity capacity;
     const LargeRecord* large;
     TileCounts counts;
-    // The function sets counters->entries. Large records beyond their capacity are not
-    // counted there.
+    // The function sets counters->entries. Large records beyond the capacity are not
+    // counted in it.
     FrameCounters* counters;
 };
 

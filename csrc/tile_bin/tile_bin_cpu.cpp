@@ -97,7 +97,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
     out.num_entries = offset[num_tiles];
     const EntryFormat format = out.format = format_of(out.chunk.data(), num_chunks);
     uint64_t* entry = out.entry.reserve(out.num_entries);
-    // the offsets of 16 tiles in a chunk fill a cache line
+    // The offsets of 16 tiles in a chunk fill a cache line.
     constexpr size_t kTogether = 16;
     parallel_for((num_tiles + kTogether - 1) / kTogether, 1, [&](size_t group) {
         const size_t first = group * kTogether, last = std::min(first + kTogether, num_tiles);
@@ -139,7 +139,7 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
     // A radix sort from the least significant digit. It sorts only the bits that differ
     // after the smallest depth is subtracted.
     constexpr int kMostBits = 12;
-    // fewer counters for few entries
+    // Few entries need few counters.
     const int most_bits = count < 1024 ? 8 : kMostBits;
     uint64_t least = ~uint64_t(0), most = 0;
     for (size_t i = 0; i < count; ++i) {

@@ -19,7 +19,7 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-// resident blocks per multiprocessor with 164 KiB of shared memory
+// Resident blocks per multiprocessor with 164 KiB of shared memory.
 constexpr unsigned kBlocks = 5;
 
 // The block size, and the blocks per multiprocessor, of count_large_kernel.
@@ -193,7 +193,7 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     }
 }
 
-// Where entries are written. A tile's list is filled from its end to its beginning.
+// The destination of entries. A tile's list is filled from its end to its beginning.
 struct Scatter {
     const unsigned long long* tile_first;
     // [num_tiles] number of free entries, initially the count of the tile
@@ -205,7 +205,8 @@ struct Scatter {
 // tile share one atomic operation.
 struct Places {
     unsigned peers;
-    uint32_t left;  // free entries before those of the lane's tile were taken
+    // Number of free entries in the tile's list before this warp adds its entries.
+    uint32_t left;
 
     // A lane with kNoTile gets no position. All lanes of the warp must call it.
     __device__ Places(const Scatter& to, uint32_t tile)
@@ -239,7 +240,8 @@ struct WaitingPlaces {
     FewTiles few[kMost];
     uint32_t record[kMost];  // the upper bits contain the number of the tile
 };
-static_assert(kFewTiles <= 1u << (32 - kMostRecordBits), "a tile fits above a record");
+static_assert(kFewTiles <= 1u << (32 - kMostRecordBits),
+              "the number of a tile is stored in the bits above the record");
 
 // Writes one entry per record of `places`. All lanes of the warp must call it.
 __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
@@ -257,7 +259,7 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
                       ? kNoTile
                       : item.first_tile + tile_of(few) + row[j] * item.columns + column[j];
     }
-    static_assert(kAtOnce == 2, "`found` has two");
+    static_assert(kAtOnce == 2, "`found` is initialised with two elements");
     const Places found[kAtOnce] = {{to, tile[0]}, {to, tile[1]}};
 #pragma unroll
     for (unsigned j = 0; j < kAtOnce; ++j) {
@@ -268,7 +270,7 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
     }
 }
 
-// Scatters the records of an item over few tiles each. All lanes of the warp must call
+// Scatters the records of an item that touch few tiles. All lanes of the warp must call
 // it.
 __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const ItemTiles& item,
                              WaitingPlaces& waiting) {

@@ -513,8 +513,8 @@ def test_a_page_that_the_system_cannot_read_is_named(saved, tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "expected a bundle, got a file of 0 bytes"),
-        (b"1234567", "expected a bundle, got a file of 7 bytes"),
+        (b"", "expected a bundle, got a file of only 0 bytes"),
+        (b"1234567", "expected a bundle, got a file of only 7 bytes"),
         (b"ply\nformat ascii 1.0\n", "header: expected a bundle"),
         ((2**64 - 1).to_bytes(8, "little"), "header: expected a bundle"),
         ((2).to_bytes(8, "little") + b"[]", "header: expected a JSON object"),
@@ -537,7 +537,8 @@ def test_what_is_not_a_bundle_is_refused(tmp_path, content, message):
 def test_other_safetensors_files_are_refused(tmp_path):
     save_file({"weights": np.zeros(3)}, tmp_path / "x.safetensors")
     with pytest.raises(
-        ValueError, match=r"x\.safetensors: format: expected 'v3dg', got null; not a bundle"
+        ValueError,
+        match=r"x\.safetensors: format: expected 'v3dg', got null; the file is not a bundle",
     ):
         Bundle.open(tmp_path / "x.safetensors")
 
@@ -840,7 +841,7 @@ def test_values_that_have_no_code_are_refused():
     bundle = random_bundle(3)
     bundle.gaussians.scales[4, 1] = np.inf
     with pytest.raises(
-        ValueError, match="gaussians: expected finite values, got infinite or NaN ones at 4"
+        ValueError, match="gaussians: expected finite values, got infinite or NaN ones in row 4"
     ):
         Bundle(bundle.clusters, bundle.groups, bundle.gaussians, codec="quantized")
 
@@ -998,7 +999,9 @@ def test_tables_of_wrong_kind_are_refused(saved):
     clusters, groups = saved[0].clusters, saved[0].groups
     with pytest.raises(TypeError, match=r"clusters.level: expected a NumPy array, got list"):
         dataclasses.replace(clusters, level=clusters.level.tolist())
-    with pytest.raises(ValueError, match=r"clusters.offset: expected int64 \(\d+,\), got int32"):
+    with pytest.raises(
+        ValueError, match=r"clusters.offset: expected dtype int64 and shape \(\d+,\), got int32"
+    ):
         dataclasses.replace(clusters, offset=clusters.offset.astype(np.int32))
     with pytest.raises(
         ValueError, match=r"clusters.box: expected float32 \(\d+, 2, 3\), got float32 \(\d+, 6\)"
@@ -1031,7 +1034,9 @@ def test_a_ball_that_barely_sticks_out_is_refused():
         1 + 4e-6
     )
     ball[above, 3] = np.float32(needed * (1 - 1e-6))
-    with pytest.raises(ValueError, match=r"groups.ball\[0\]: expected a ball inside that of group"):
+    with pytest.raises(
+        ValueError, match=r"groups.ball\[0\]: expected a ball inside the ball of group"
+    ):
         Bundle(bundle.clusters, dataclasses.replace(bundle.groups, ball=ball), bundle.gaussians)
 
 

@@ -79,7 +79,10 @@ def test_folders_without_cameras_are_refused(tmp_path, cameras):
     write_model(tmp_path / "a", cameras)
     path = tmp_path / "a" / "images.bin"
     path.write_bytes(path.read_bytes()[:40])
-    with pytest.raises(ValueError, match=r"images\.bin: expected 3 entries, got 40 bytes"):
+    with pytest.raises(
+        ValueError,
+        match=r"images\.bin: expected at least [0-9]+ bytes for 3 entries, got a file of 40 bytes",
+    ):
         read_cameras(tmp_path / "a")
 
 
@@ -290,7 +293,7 @@ def test_numbers_of_binary_models_may_not_be_finite(tmp_path, cameras, file, pla
     content = bytearray(path.read_bytes())
     content[place : place + 8] = struct.pack("<d", float("nan"))
     path.write_bytes(content)
-    with pytest.warns(CameraWarning, match="left out: images/é3.jpg"):
+    with pytest.warns(CameraWarning, match="skipped: images/é3.jpg"):
         assert list(read_cameras(tmp_path / "a")) == list(cameras)[1:]
 
 
@@ -304,7 +307,9 @@ def test_models_that_claim_too_much_are_refused(tmp_path, cameras):
             with pytest.raises(ValueError, match=f"{name}: expected "):
                 read_cameras(tmp_path / "a")
         path.write_bytes((1 << 60).to_bytes(8, "little") + good[8:])
-        with pytest.raises(ValueError, match=f"{name}: expected {1 << 60} entries, got"):
+        with pytest.raises(
+            ValueError, match=f"{name}: expected .* bytes for {1 << 60} entries, got"
+        ):
             read_cameras(tmp_path / "a")
         path.write_bytes(good)
 

@@ -86,7 +86,9 @@ def test_files_of_another_kind_are_named(bundle, camera, tmp_path):
         lambda: v3dg.pick(bundle, "a.json", 0, 0),
         lambda: v3dg.rasterize(bundle.level_gaussians(0), "a.json"),
     ):
-        with pytest.raises(TypeError, match=r"camera: .* got str; v3dg\.read_cameras reads files"):
+        with pytest.raises(
+            TypeError, match=r"camera: .* got str; v3dg\.read_cameras reads camera files"
+        ):
             call()
 
 

@@ -63,9 +63,7 @@ def test_a_file_that_ends_before_is_told(tmp_path, size):
     path.write_bytes(bytes(size - 1))
     with open(path, "rb") as file:
         reading = _core.HashedReader().read(str(path), file.fileno(), b"", 0, size, True)
-    with pytest.raises(
-        ValueError, match=r"data: size: expected more bytes after offset 0, .*truncated"
-    ):
+    with pytest.raises(ValueError, match=r"data: size: expected .*bytes.* 0, .*truncated"):
         reading.wait()
 
 

@@ -554,7 +554,7 @@ HOSTILE = {
         header(*vertex_lines(1), "property list uchar int n", format_line=ASCII)
         + b"0 " * 14
         + b"-1",
-        "vertex 0: expected a length of list 'n', got -1",
+        "vertex 0: expected a whole number as length of list 'n', got -1",
     ),
     "ascii in one line of many megabytes": (
         header(*vertex_lines(1), format_line=ASCII) + b"0 " * 3_000_000,
@@ -566,7 +566,7 @@ HOSTILE = {
     ),
     "list of negative length": (
         header("element face 1", "property list char double n", *vertex_lines(0)) + b"\xff" * 40,
-        "expected a length of list 'n' in row 0, got -1",
+        "expected a whole number as length of list 'n' in row 0, got -1",
     ),
     "vertex with lists, truncated": (
         header(*vertex_lines(2), "property list uchar int n") + b"\1" * (2 * 57),

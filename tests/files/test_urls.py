@@ -694,7 +694,11 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
             ValueError,
             "clusters: expected at most 39268534564 clusters for the size of its pages",
         ),
-        ("forged tables of 2 TB", ValueError, "tables: expected at most 1073741824 bytes at a URL"),
+        (
+            "forged tables of 2 TB",
+            ValueError,
+            "tables: expected at most 1073741824 bytes for a file at a URL",
+        ),
         ("unknown size without end", ValueError, "expected at most 1048576 bytes, got more"),
         ("asset without end", ValueError, r"expected at most \d+ bytes, got more"),
     ],
@@ -748,7 +752,7 @@ def test_no_more_is_fetched_than_there_is_room_for(web, tmp_path, monkeypatch):
 @pytest.mark.parametrize("host", ["me:hunter2/x@host", "me:hunter2#x@host"])
 def test_a_url_that_is_none_is_an_error_without_its_password(host):
     pytest.importorskip("aiohttp")
-    with pytest.raises(ValueError, match="expected a URL with a host; check it") as caught:
+    with pytest.raises(ValueError, match="expected a URL with a host; check the URL") as caught:
         v3dg.open(f"http://{host}/a.ply")
     assert "hunter2" not in str(caught.value)
 

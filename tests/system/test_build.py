@@ -568,7 +568,8 @@ def test_gaussians_that_no_pixel_can_show_are_left_out_silently(asset, device):
 def test_asset_with_nothing_left_is_refused(asset, device):
     hidden = scenes.replaced(asset, opacities=np.full(1200, 0.001, np.float32))
     with pytest.raises(
-        ValueError, match=r"asset: expected at least one gaussian that can be drawn, but 1,200 of"
+        ValueError,
+        match=r"asset: expected at least one gaussian that can be drawn, got none: 1,200",
     ):
         build(hidden, device=device)
 

@@ -126,7 +126,7 @@ def test_a_name_that_is_nearly_there_is_proposed(tmp_path):
         "donut.v3d",
         cwd=tmp_path,
     )
-    fails(1, "got a path that does not exist; check it", "info", "tree.v3dg", cwd=tmp_path)
+    fails(1, "got a path that does not exist; check the path", "info", "tree.v3dg", cwd=tmp_path)
 
 
 def test_a_link_that_leads_nowhere_is_named(tmp_path):

@@ -150,7 +150,7 @@ def test_strict_refuses_also_what_resume_would_keep(folder):
     assert run("build", "bad.ply", *FAST, cwd=folder).returncode == 0
     fails(
         1,
-        "bad.ply: asset: expected gaussians",
+        "bad.ply: asset: expected only gaussians",
         "build",
         "bad.ply",
         *FAST,

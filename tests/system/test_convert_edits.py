@@ -116,7 +116,7 @@ def test_edits_apply_to_a_level_and_to_a_cut(folder):
         (2, "--add: expected FILE@X,Y,Z", ["--add", "tuft.ply@1,2"]),
         (2, "--add: expected a finite position and a positive", ["--add", "tuft.ply@1,2,3,0"]),
         (1, "no.ply: expected a file", ["--add", "no.ply@1,2,3"]),
-        (1, "--crop: nothing is left of 2,001 gaussians", ["--crop", "sphere:0,0,99,1"]),
+        (1, "--crop: nothing remains of 2,001 gaussians", ["--crop", "sphere:0,0,99,1"]),
     ],
 )
 def test_wrong_edits_are_named_and_nothing_is_written(folder, code, message, options):

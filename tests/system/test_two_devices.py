@@ -189,13 +189,13 @@ def test_frame_refuses_what_is_on_the_other_device():
     bundle = scenes_lod.lod_bundle(np.random.default_rng(12), asset(12), 64)
     frame = _core.SceneFrame(0)
     with pytest.raises(
-        ValueError, match="models: expected objects on the frame's device, got others"
+        ValueError, match="models: expected objects on the frame's device, got some on another"
     ):
         frame.set_models([residency.model(bundle, Device(1))], [])
     colors = np.zeros((len(bundle.clusters.level), 3), np.float32)
     palette = _core.Palette(residency.table(bundle), colors, 1)
     with pytest.raises(
-        ValueError, match="palettes: expected objects on the frame's device, got others"
+        ValueError, match="palettes: expected objects on the frame's device, got some on another"
     ):
         frame.set_models([residency.model(bundle, Device(0))], [palette])
     scene = Scene.of(bundle)

@@ -345,7 +345,7 @@ def test_no_two_sites_have_the_same_token(opened):
 def test_where_no_port_is_free_the_viewer_does_not_wait_for_ever(blob_view):
     with (
         socket.create_server(("127.0.0.1", 65535)),
-        pytest.raises(ValueError, match="port: expected a free one"),
+        pytest.raises(ValueError, match="port: expected a free port"),
     ):
         Site(blob_view, port=65535)
 

@@ -176,7 +176,7 @@ def test_rows_of_mixed_devices_are_refused(name):
 
 @pytest.mark.skipif(_core.has_cuda, reason="built with CUDA")
 def test_arrays_on_a_device_need_a_core_with_cuda():
-    message = f"means: expected a NumPy array, got one on a CUDA device, and {BUILT_WITHOUT}"
+    message = f"means: this array is on a CUDA device, but {BUILT_WITHOUT}"
     with pytest.raises(RuntimeError, match=message):
         rows(OnDevice)
     with pytest.raises(RuntimeError, match=message):
@@ -197,7 +197,7 @@ def test_rows_that_begin_between_words_are_copied():
     """Part of a tensor, of which the core could not read four floats at once."""
     many = scenes.gaussians([[0, 0, 1], [1, 2, 3], [4, 5, 6]])
     there, last = many.torch("cuda"), slice(1, None)
-    with pytest.raises(ValueError, match="quats, sh: expected memory aligned to 16 bytes"):
+    with pytest.raises(ValueError, match="quats, sh: expected memory that is aligned to 16 bytes"):
         _core.Rows(*(getattr(there, name)[last] for name in scenes.NAMES))
     box = _core.bound_by_boxes(there.subset(last).rows, np.array([0, 2]))
     np.testing.assert_array_equal(

@@ -155,6 +155,14 @@ def test_cuts_are_fine_enough_everywhere_in_the_image(lens):
     assert camera.core.px2_per_steradian >= (0.01 / area).max() * (1 - 1e-3)
 
 
+def test_several_cameras_are_drawn_as_if_alone(lens):
+    scene = scene_around(np.random.default_rng(4))
+    cameras = [camera_of(lens), camera_of(lens)]
+    options = {"tolerance": 2, "device": "cpu"}
+    for image in v3dg.render(scene, cameras, **options):
+        assert_same_bytes_of_color(image, v3dg.render(scene, cameras[0], **options))
+
+
 @pytest.mark.gpu
 def test_cuda_draws_what_the_cpu_draws(lens):
     rng = np.random.default_rng(6)
@@ -296,6 +304,8 @@ def test_what_needs_a_pinhole_says_so(lens):
     bundle = lod_bundle(rng, blob(rng, 100), 16)
     with pytest.raises(ValueError, match=r"^left: expected a pinhole, got OPENCV"):
         StereoCamera.of(camera, 0.06)
+    with pytest.raises(ValueError, match=r"^cameras\[0\]: expected a pinhole, got OPENCV"):
+        v3dg.CameraBatch.of([camera, camera])
     with pytest.raises(ValueError, match=r"^footprint: expected 'solid_angle' for a distorted"):
         select(bundle, camera, footprint="paper", device="cpu")
     with pytest.raises(ValueError, match=r"^cameras\[0\]: expected a pinhole, got OPENCV"):

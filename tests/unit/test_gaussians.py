@@ -74,12 +74,12 @@ def test_survives_pickling():
         (
             {"sh": np.zeros((5, 5, 3), np.float32)},
             ValueError,
-            "sh: expected shape (5, K, 3) with K 1, 4, 9 or 16, got (5, 5, 3)",
+            "sh: expected shape (5, K, 3) with K = 1, 4, 9 or 16, got (5, 5, 3)",
         ),
         (
             {"sh": np.zeros((5, 3), np.float32)},
             ValueError,
-            "sh: expected shape (5, K, 3) with K 1, 4, 9 or 16, got (5, 3)",
+            "sh: expected shape (5, K, 3) with K = 1, 4, 9 or 16, got (5, 3)",
         ),
         (
             {"scales": np.zeros((5, 3))},

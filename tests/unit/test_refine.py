@@ -577,7 +577,7 @@ def test_the_core_refuses_what_does_not_fit(bundle, device):
     wrong = {
         "radius: expected positive numbers, got 0": {"radius": np.zeros(count, np.float32)},
         "radius: expected": {"radius": np.ones(count - 1, np.float32)},
-        f"gaussians: expected {count}, which the table has, got {count - 1}": {
+        f"gaussians: expected {count} as in the table, got {count - 1}": {
             "gaussians": on(device, bundle.gaussians.subset(np.arange(count - 1))).rows,
             "radius": np.ones(count - 1, np.float32),
         },
@@ -590,12 +590,14 @@ def test_the_core_refuses_what_does_not_fit(bundle, device):
 def test_pictures_are_refused_of_nothing(bundle):
     given = {"table": residency.table(bundle), "cameras": [], "seed": 0}
     nothing = bundle.gaussians.subset(slice(0, 0))
-    with pytest.raises(ValueError, match="asset: expected gaussians on the host, got none"):
+    with pytest.raises(ValueError, match="asset: expected at least one gaussian, got none"):
         _core.CutPictures(asset=nothing.rows, **given)
 
 
 @pytest.mark.gpu
 def test_pictures_are_refused_of_an_asset_elsewhere(bundle):
     given = {"table": residency.table(bundle), "cameras": [], "seed": 0}
-    with pytest.raises(ValueError, match="asset: expected gaussians on the host, got others"):
+    with pytest.raises(
+        ValueError, match="asset: expected gaussians on the host, got gaussians on a device"
+    ):
         _core.CutPictures(asset=on("cuda", bundle.level_gaussians(0)).rows, **given)

@@ -78,7 +78,7 @@ def _problem_of(url: str, error: Exception) -> Problem:
     installed."""
     names = {kind.__name__ for kind in type(error).__mro__}
     cause = error
-    # If aiohttp could not connect, this is the error of the system.
+    # If aiohttp could not connect, `os_error` is the error of the operating system.
     system_error = getattr(error, "os_error", None)
     if isinstance(system_error, OSError):
         cause = system_error

@@ -79,7 +79,7 @@ def _place_of(url: str) -> tuple[str, str]:
     if "@" in host:
         start = host.rindex("@") + 1
     elif "@" in address and not re.fullmatch(r"(\[.*\]|[^:]*)(:[0-9]*)?", host):
-        # A character of the password looks like the end of the host.
+        # The password contains a character that looks like the end of the host.
         start = address.rindex("@") + 1
     else:
         start = 0

@@ -56,9 +56,10 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
     url = full(path)
     name = beside(path).name
     expected = "the URL of a bundle, or of an asset in one file"
+    check(shown(url), name, f"{expected}, got the URL of a folder; add the file's name")
     check(
         shown(url),
-        name and not name.endswith(".json"),
+        not name.endswith(".json"),
         f"{expected}, got the URL of a file that refers to other files; download its folder",
     )
     check(

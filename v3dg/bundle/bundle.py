@@ -142,8 +142,8 @@ class Bundle:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
-            # This must be checked before any size is computed from the number of
-            # gaussians.
+            # The number of gaussians must be checked before any size is computed from
+            # it.
             max_gaussians = file.pages_bytes // file.codec.gaussian_bytes
             expected = f"at most {max_gaussians} gaussians, got {num_gaussians}"
             check("clusters.offset[-1]", num_gaussians <= max_gaussians, expected)
@@ -153,7 +153,7 @@ class Bundle:
             bundle = cls.__new__(cls)
             cls._set(bundle, clusters, groups, file.config, pages, file)
         except ValueError as error:
-            # Inconsistent tables are mostly due to damage; then this raises the error.
+            # Inconsistent tables are mostly due to damage, which `verify` reports.
             file.verify()
             raise ValueError(f"{file.path}: {error}") from None
         file.verify()  # last, because the tables are hashed while they are checked
@@ -302,7 +302,8 @@ class Bundle:
 
     def read_page(self, page: int) -> Gaussians:
         """Return the gaussians of a page, after verifying its hash. Page g contains the
-        clusters that group g replaces; the last page contains the last level."""
+        clusters that group g replaces; the last page contains the coarsest level, which
+        no group replaces."""
         check_index("page", page, self.num_pages)
         return self._pages.read(page, page + 1)
 
@@ -330,7 +331,7 @@ class Bundle:
 
     def info(self) -> JsonObject:
         """Return a description of the bundle as a JSON object, without reading
-        gaussians. Sizes are those of its file."""
+        gaussians. Sizes in bytes are those of the bundle's file."""
         page_level = self.clusters.level[self._layout.first_cluster[:-1]]
         page_sizes = self._layout.page_bytes(self._codec)
         sizes = [int(page_sizes[page_level == level].sum()) for level in range(self.num_levels)]

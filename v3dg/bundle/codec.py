@@ -27,8 +27,8 @@ class Codec:
     """
 
     name: ClassVar[str] = "float32"
-    # This is the size of a memory page, so that the operating system can map or load
-    # pages directly.
+    # The alignment is the size of a memory page, so that the operating system can map
+    # or load pages of the bundle directly.
     alignment: int = 4096
 
     def __init__(self, sh_degree: int) -> None:

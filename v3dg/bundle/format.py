@@ -49,7 +49,7 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-# These tables are only in float32 files. In quantised files, they would follow from the
+# Tables that only float32 files have. In quantised files, they would follow from the
 # other tables.
 _ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")
 

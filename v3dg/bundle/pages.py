@@ -84,7 +84,8 @@ class PageRun:
     positions in a file."""
 
     first_page: int  # index of the first page in the bundle
-    # (n+1,) first cluster of each page, counted from the first one here, and the end.
+    # (n+1,) index of the first cluster of each page, relative to the first cluster of
+    # the run, and the number of clusters in the run.
     first_cluster: NDArray[np.int64]
     # Boundaries of the gaussians of all clusters, as indices in the bundle.
     offset: NDArray[np.int64]
@@ -110,7 +111,7 @@ class PageRun:
 
     def clusters_of(self, number: int) -> NDArray[np.int64]:
         """Return the boundaries of the gaussians of one page's clusters, relative to
-        the first gaussian of all pages here. `number` is the index of the page here."""
+        the first gaussian of the run. `number` is the index of the page in the run."""
         first, last = self.first_cluster[number : number + 2].tolist()
         return np.asarray(self.offset[first : last + 1] - self.offset[0])
 

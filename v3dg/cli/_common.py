@@ -179,15 +179,15 @@ def _similar(path: Path) -> str:
 
 
 def open_subject(path: Path, *, show: bool) -> tuple[Subject, dict[str, Camera] | None]:
-    """Open a scene with its cameras, a bundle or an asset. With ``show``, display that
-    reading takes time."""
+    """Open a scene with its cameras, a bundle or an asset. With ``show``, report on
+    stderr that the file is being read."""
     with waiting(printable(f"reading {shown(path)}"), show=show):
         return open_with_cameras(path)
 
 
 def check_output(output: Path, *inputs: Path) -> None:
-    """Raise an error for an output that is a URL, or that would overwrite an input,
-    which may contain more than the output."""
+    """Raise an error for an output that is a URL or that would overwrite an input. The
+    input may contain more than the output."""
     check_usage(shown(output), not is_url(output), "a local file as output, got a URL")
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))

@@ -40,8 +40,9 @@ Faults: TypeAlias = Annotated[FaultOptions, tyro.conf.OmitArgPrefixes]
 
 @dataclass(frozen=True)
 class Checked:
-    """The gaussians to write; the number of those left out for each kind of invalid
-    value; and a line about invalid values, which is empty if there are none."""
+    """The gaussians to write; the number of gaussians that were left out for each kind
+    of invalid value; and a line about invalid values, which is empty if there are
+    none."""
 
     gaussians: Gaussians
     dropped: dict[str, int]

@@ -115,15 +115,15 @@ class Program:
         return re.findall(r"--[a-z][a-z-]*", printed.getvalue())
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
-        """Run one command and return its exit code. By default, it is the command with
-        which this process was started."""
+        """Run one command and return its exit code. ``arguments`` are the words of the
+        command line; by default those of this process."""
         if arguments is None:
             warnings.showwarning = lambda message, *_, **__: tell(f"v3dg: warning: {message}")
         code = 0
         try:
             code = self._run(arguments)
             code = _flush(code)
-        # After the command has ended, or while an interrupt was handled.
+        # The command may be interrupted, or Ctrl-C may be pressed after it has ended.
         except KeyboardInterrupt:
             if arguments is not None:
                 raise

@@ -265,7 +265,7 @@ def ask_up(path: Path, axis: Axis) -> Axis:
     accepts `axis`."""
     while True:
         question = printable(
-            f"{beside(path).name}: which axis points up, {', '.join(AXES)}? [{axis}]"
+            f"{beside(path).name}: which axis points up, {', '.join(AXES)}? [{axis}] "
         )
         print(question, end="", file=sys.stderr, flush=True)
         answer = sys.stdin.readline().strip() or axis

@@ -133,7 +133,7 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         yield None
         return
     distributed = _extras.load("distributed")
-    # The command itself reports errors, once.
+    # dask must not log errors, because the command reports them.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     _greet(address)
@@ -381,7 +381,8 @@ def _build_file(
     if options.strict:
         unusable = "refuse"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AssetWarning)  # the result reports them
+        # The result reports these warnings.
+        warnings.simplefilter("ignore", AssetWarning)
         return build_file(
             paths,
             output,

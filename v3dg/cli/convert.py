@@ -93,7 +93,8 @@ def run(options: Convert) -> None:
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AssetWarning)  # the result reports them
+        # The result reports these warnings.
+        warnings.simplefilter("ignore", AssetWarning)
         subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
     output = options.output
     notes: list[str] = []

@@ -41,7 +41,7 @@ _LOCATED = (
     "is_seen",
 )
 _FARTHEST = 1e10
-# These only change how gsplat computes, not its results.
+# Arguments that only change how gsplat computes, and not its results.
 _IGNORED = {"tile_size", "channel_chunk", "segmented"}
 # Arguments of gsplat that are not supported, with advice.
 _UNSUPPORTED = {

@@ -8,7 +8,8 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-# With O_NONBLOCK, opening a pipe does not wait for a writer. Regular files ignore it.
+# With O_NONBLOCK, opening a pipe does not wait for a writer. The flag has no effect on
+# regular files.
 _FILE = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 

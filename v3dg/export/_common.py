@@ -38,7 +38,7 @@ _WORLDS = {"y": _axes.GLTF, "z": _axes.Z_UP}
 
 
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
-    """Return the (3, 3) rotation that turns the up axis of a world to the up axis of a
+    """Return the (3, 3) rotation that maps the up axis of a world to the up axis of a
     format."""
     return _axes.turn(_axes.axes_of_up(up), _WORLDS[frame])
 

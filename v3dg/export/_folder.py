@@ -113,7 +113,8 @@ def replacing_export(
 def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
     """Move back the files of an export that did not finish, and remove its hidden
     folder."""
-    # The error of the export itself is reported.
+    # Errors of moving files back are ignored, because the error of the export is
+    # reported.
     with contextlib.suppress(OSError, ValueError):
         if _restore(root, hidden, folder):
             _remove_unused_folders(root, hidden, folder)
@@ -129,14 +130,15 @@ def _made(folder: Path) -> Iterator[Path]:
     """Create a folder and the folders above it, and yield its path without links. After
     an error, remove the created folders if they are empty."""
     target = Path(os.path.realpath(folder))
-    # From the innermost outwards.
+    # The missing folders, from the innermost outwards.
     missing = [path for path in (target, *target.parents) if not path.exists()]
     try:
         target.mkdir(parents=True, exist_ok=True)
         yield target
     except BaseException:
         for path in missing:
-            # Not empty: another program has written to the folder.
+            # A folder stays if it is not empty because another program has written to
+            # it.
             with contextlib.suppress(OSError):
                 path.rmdir()
         raise
@@ -208,8 +210,8 @@ class _Place:
             check(self._folder / name, self._overwrite, f"{expected}; {advice}")
 
     def put(self, record: Record, path: Path) -> None:
-        """Replace the files of the earlier export by the new files. `path` is where the
-        new record is written first."""
+        """Replace the files of the earlier export by the new files. `path` is the
+        temporary path of the new record."""
         root = self._root
         hidden = self.hidden
         self.check([*record.files, RECORD])

@@ -65,8 +65,8 @@ class Record:
         """Return the record of all files below a folder to which no other program
         writes; without folders.
 
-        Files are sorted so that those in subfolders come first, because the others
-        refer to them.
+        Files are sorted so that those in subfolders come first, because the other files
+        refer to those in subfolders.
         """
         names = [file.relative_to(path).as_posix() for file in path.rglob("*") if not file.is_dir()]
         assert all(_FILE_NAME.fullmatch(name) and name != RECORD for name in names), names

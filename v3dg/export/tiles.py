@@ -290,8 +290,8 @@ def _write_tileset(
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
-        # These include the extensions in other tilesets, because CesiumJS reads only
-        # those of the first tileset.
+        # The extensions of all tilesets, because CesiumJS reads only the list in the
+        # first one.
         "extensions": {_CONTENT: extensions},
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},

@@ -37,10 +37,11 @@ def write_usd(
     Needs the extra `usd`.
 
     Each bundle is a prim with UsdLod's LODRootAPI. Its children are the levels, finest
-    first, as ParticleField3DGaussianSplat. Levels switch where half of a level's groups
-    have the default tolerance in a picture of 1920 x 1080 px. A scene is a
-    PointInstancer of such prims. Positions are float32. Importance, opacity and tint of
-    instances are left out, the latter two with a warning.
+    first, as ParticleField3DGaussianSplat. A level is replaced by the next coarser one
+    at the distance at which half of the groups that make the coarser level fall below
+    the default tolerance, in a picture of 1920 x 1080 px. A scene is a PointInstancer
+    of such prims. Positions are float32. Importance, opacity and tint of instances are
+    left out, the latter two with a warning.
 
     Args:
         subject: A scene or a bundle, or the path of its file.
@@ -104,8 +105,8 @@ def _define_levels(stage: "Usd.Stage", place: str, bundle: Bundle) -> None:
     high = bundle.clusters.box[:, 1].max(axis=0)
     radius = float(np.linalg.norm(high - low)) / 2
     detail = _common.detail_of(bundle)
-    # The share of the picture that the ball around the box covers at the distance from
-    # which on level 1 is fine enough.
+    # The fraction of the picture that the ball around the box covers at the distance at
+    # which level 1 becomes fine enough.
     share = math.pi * DEFAULT_TOLERANCE / _PIXELS * (radius / max(detail["reach"], _LEAST)) ** 2
     sizes = [share / detail["ratio"] ** (2 * level) for level in range(bundle.num_levels - 1)]
     heuristic = pxr.UsdLod.ScreenSizeHeuristic.Define(stage, f"/lod{place.replace('/', '_')}")

@@ -37,8 +37,8 @@ class Document:
         self.claims = Claims()
         self._binary: memoryview | None = None
         self._buffers: dict[int, memoryview] = {}
-        # By device and inode, because several buffers may refer to one file by
-        # different names.
+        # Contents of files by device and inode, because several buffers may refer to
+        # one file by different names.
         self._files: dict[tuple[int, int], memoryview] = {}
         content = self.claims.read(path)
         is_binary = content[:4] == b"glTF" or path.suffix.lower() != ".gltf"

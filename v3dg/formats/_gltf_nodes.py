@@ -162,7 +162,9 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
         determinant = float(np.linalg.det(rotation))
     expected = "expected a rotation, a translation and positive scales"
     if not (np.isfinite(matrix).all() and (lengths > 0).all() and np.isfinite(lengths).all()):
-        raise placement.node.problem(f"{expected}, got a scale of 0 or a number that overflows")
+        raise placement.node.problem(
+            f"{expected}, got a scale of 0 or a number that overflows; correct the node"
+        )
     if determinant < 0:
         raise placement.node.problem(f"{expected}, got a reflection; apply it to the file first")
     if not abs(determinant - 1) <= _MOST_SHEAR:
@@ -189,7 +191,7 @@ def _stretched(gaussians: Gaussians, factors: Floats) -> Gaussians:
         scales = gaussians.scales[rows].astype(np.float64)
         axes = rotation_from_quaternion(normalised(quats)) * scales[:, None, :]
         axes *= factors[:, None]
-        # Gaussians with other values cannot be drawn, and are not changed.
+        # Gaussians whose values are not finite cannot be drawn. They are not changed.
         is_good = np.isfinite(axes).all(axis=(1, 2))
         rotations, lengths, _ = np.linalg.svd(axes[is_good])
         rotations[:, :, 2] *= np.sign(np.linalg.det(rotations))[:, None]

@@ -43,11 +43,12 @@ _PROPERTIES = {
     "sortingMethod": ("cameraDistance",),
 }
 _POINTS = 0
-_TRIANGLES = 4  # the mode of a primitive without a mode
+_TRIANGLES = 4  # the default mode of a primitive
 # Number of directions in which converted colours are fitted by spherical harmonics:
 # enough for 16 coefficients.
 _NUM_DIRECTIONS = 64
-# Gaussians that are fitted together, so that their colours stay in the cache.
+# Number of gaussians that are fitted together, small enough that their colours stay in
+# the cache.
 _FITTED_AT_ONCE = 1 << 12
 
 
@@ -337,6 +338,6 @@ def _directions() -> Floats:
 
 
 def _srgb_from_linear(colors: Floats) -> Floats:
-    """Return linear colours in sRGB (IEC 61966-2-1); negative values become black."""
+    """Convert linear colours to sRGB (IEC 61966-2-1). Negative values become black."""
     light = np.maximum(colors, 0.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

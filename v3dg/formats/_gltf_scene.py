@@ -58,7 +58,7 @@ class Scene:
     def read(self) -> Gaussians:
         """Return the gaussians, in the order of nodes and primitives."""
         gaussians = empty(self.count, self.degree)
-        # Placements of each mesh, with the first row.
+        # For each mesh: its placements, each with the first row of its gaussians.
         uses: dict[int, list[tuple[Placement, int]]] = {}
         row = 0
         for placement in self._placements:
@@ -67,7 +67,7 @@ class Scene:
         for mesh, places in uses.items():
             offset = 0
             for primitive in self._primitives[mesh]:
-                # Each primitive is read once, and freed before the next.
+                # Each primitive is read once, and freed before the next one is read.
                 part = primitive.read()
                 for placement, first in places:
                     put(placed(part, placement), gaussians, first + offset)
@@ -91,7 +91,8 @@ class Scene:
         primitives = [primitive for mesh in self._primitives.values() for primitive in mesh]
         claims.add(path, self.count)
         claims.add(path, sum(max(0, part.num_rows - part.count) for part in primitives))
-        # Bounded so that many primitives cannot share one large stream.
+        # The limit applies to all primitives together, so that many of them cannot
+        # share one large stream.
         num_packed = sum(primitive.packed_bytes for primitive in primitives)
         limit = claims.num_bytes
         check(
@@ -116,7 +117,7 @@ class Scene:
         ]
 
     def _unused_meshes(self) -> list[int]:
-        """Return the meshes with gaussians that no node of the scene has."""
+        """Return the meshes with gaussians that no node of the scene uses."""
         document = self._document
         return [
             mesh
@@ -147,7 +148,7 @@ def _extension_notes(document: Document) -> list[str]:
 
 
 def _extensions(document: Document, kind: str) -> list[tuple[str, Node]]:
-    """Return the extensions in a list of the root, with the place of each name."""
+    """Return the names in a list of extensions of the root, each with its JSON node."""
     if not document.root.has(kind):
         return []
     names = document.root.field(kind)

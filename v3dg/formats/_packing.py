@@ -24,9 +24,9 @@ coefficient."""
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 """The SH degree for each number of coefficients per channel after the first."""
 
-# Gaussians that are decoded together: a block of doubles fits into the cache.
+# Number of gaussians that are decoded together. A block of doubles fits into the cache.
 _BLOCK = 1 << 16
-# 2e-9: replaces scales of 0, whose logarithm no quantised format can store.
+# Minimum logarithm of a scale, that of 2e-9. A scale of 0 has no finite logarithm.
 _MIN_LOG_SCALE = -20.0
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 
@@ -46,8 +46,8 @@ class Limits:
     harmonic: tuple[float, float] = (-math.inf, math.inf)
 
 
-# For the index of the omitted component of a quaternion: the indices of the stored
-# ones.
+# The indices of the stored components of a quaternion, by the index of its omitted
+# component.
 _STORED_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 

@@ -39,7 +39,7 @@ from v3dg.rotations import normalised
 
 _FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 _NERFSTUDIO = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-# The second one is that of versions before 1.1.
+# The second prefix is that of nerfstudio before version 1.1.
 _NERFSTUDIO_PREFIXES = ("_model.gauss_params.", "_model.")
 # Indices into the tuple that the papers' code stores, in the order of _FIELDS.
 _CAPTURED = (1, 4, 5, 6, 2, 3)
@@ -117,7 +117,7 @@ class _Named(NamedTuple):
 
 
 class _Tensor(NamedTuple):
-    kind: str  # the type of the numbers in its storage
+    kind: str  # the type of the stored numbers
     key: str
     num_stored: int
     offset: int

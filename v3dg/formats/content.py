@@ -24,8 +24,8 @@ _BY_START = {
     b"PXR-USDC": ".usdc",
 }
 # First bytes, in lower case, of files that no reader supports, and descriptions of
-# these files. A `.splat` may begin with any bytes, but hardly by chance with so many of
-# these.
+# these files. A `.splat` may begin with any bytes, so each entry is too long to occur
+# by chance.
 _NOT_READ = {
     b"version https://git-lfs": "a Git LFS pointer instead of the file; run git lfs pull",
     b"<!doctype html": "a web page; download the file itself",

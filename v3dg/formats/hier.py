@@ -40,13 +40,17 @@ def open_file(path: AnyPath) -> AssetFile:
     dtypes = [np.dtype(("<f4", _WIDTHS[0])), *(np.dtype((kind, width)) for width in _WIDTHS[1:])]
     column_starts = 4 + np.cumsum([0, *(count * dtype.itemsize for dtype in dtypes)])
     columns_end = int(column_starts[-1])
-    check(path, columns_end + 4 <= file.num_bytes, f"{count} gaussians, got {file.num_bytes} bytes")
+    least_bytes = columns_end + 4
+    expected = f"at least {least_bytes} bytes for {count} gaussians"
+    damaged = f"got a file of {file.num_bytes} bytes; the file is damaged, or no .hier file"
+    check(path, least_bytes <= file.num_bytes, f"{expected}, {damaged}")
     num_nodes = int(file.rows(_INT, columns_end, 1)[0])
-    # Including the box of the node, which is not read.
+    # The size includes the box of the node, which is not read.
     node_bytes = node.itemsize + 8 * np.dtype(kind).itemsize
-    fits = num_nodes * node_bytes == file.num_bytes - columns_end - 4
-    check(path, fits, f"exactly {num_nodes} nodes, got {file.num_bytes} bytes")
-    leaves = _leaves(path, file.rows(node, columns_end + 4, num_nodes), count)
+    num_bytes = least_bytes + num_nodes * node_bytes
+    expected = f"{num_bytes} bytes for {count} gaussians and {num_nodes} nodes"
+    check(path, num_bytes == file.num_bytes, f"{expected}, {damaged}")
+    leaves = _leaves(path, file.rows(node, least_bytes, num_nodes), count)
 
     def read(first: int, last: int) -> Gaussians:
         rows = leaves[first:last]

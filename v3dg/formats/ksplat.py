@@ -222,7 +222,7 @@ def _decoded(
         for band in range(1, math.isqrt(1 + higher.shape[1] // 3)):
             first = band**2
             last = (band + 1) ** 2
-            # In the order of the file: channel by channel.
+            # The file stores coefficients channel by channel.
             coefficients = higher[:, 3 * (first - 1) : 3 * (last - 1)]
             sh[:, first:last] = coefficients.reshape(-1, 3, last - first).transpose(0, 2, 1)
         return means, normalised(rows["quat"]), rows["scale"], rgba[:, 3], sh

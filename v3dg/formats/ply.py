@@ -25,8 +25,8 @@ _MAX_COLOR = 8.0
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.ply` file. A file with packed positions is read as a compressed one, for
-    any file name."""
+    """Open a `.ply` file. A file with packed positions is read as a `.compressed.ply`
+    file, whatever its name is."""
     name = os.fspath(path)
     _, _, elements = _core.ply_header(name)
     if any("packed_position" in dict(properties) for _, _, properties in elements):

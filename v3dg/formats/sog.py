@@ -123,7 +123,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     count, degree = _size(meta)
     names = _names(meta)
     pictures = {name: load(name) for part in names.values() for name in part}
-    # After opening all files, because their total size bounds the number.
+    # All files are open now. Their total size limits the number of gaussians.
     claims.add(path, count)
 
     def pixels(name: str) -> _Pixels:
@@ -282,7 +282,7 @@ def _decoded(
     has_size = num_pixels <= width * height <= _MAX_PIXELS_FACTOR * num_pixels + _FREE_PIXELS
     expected = f"{num_pixels} pixels"
     if row is not None:
-        expected += f"in rows of {row} pixels"
+        expected += f" in rows of {row} pixels"
     check(
         path, has_size and row in (None, width), f"{expected} in {name!a}, got {width} x {height}"
     )

@@ -55,7 +55,8 @@ _MOST_POINTS = 100_000  # number of points that are used to detect a ground
 # The type of an extension and the number of bytes that follow.
 _EXTENSION = struct.Struct("<II")
 _AXES_EXTENSION = 0xADBE0003  # SPZ_ADOBE_coordinate_system
-# The axes by their number in that extension, as defined by version 4 of the library.
+# The axes by their number in SPZ_ADOBE_coordinate_system, as defined by version 4 of
+# Niantic's library.
 _AXES = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
@@ -377,7 +378,8 @@ def _sections_of_gzip(path: AnyPath, content: bytes, claims: Claims) -> _Content
         # A limit of 0 would mean no limit; this one is always positive.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
-            # This reads the checksum if nothing else follows.
+            # One more byte is requested, so that the checksum is read if nothing else
+            # follows.
             stream.decompress(stream.unconsumed_tail, 1)
     is_whole = len(body) >= total and stream.eof
     check(

@@ -45,7 +45,8 @@ SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 # The axes of a stage by its up axis; the cameras of a stage look along -z.
 _AXES = {"Y": _axes.OPENGL, "Z": _axes.Z_UP}
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
-# Custom data of a prim, because the schema has no attribute for this.
+# The custom data of a prim for antialiasing, because the schema has no attribute for
+# it.
 _ANTIALIASED = "antialiased"
 _SH = "radiance:sphericalHarmonics"
 _HALVES = (
@@ -56,10 +57,11 @@ _HALVES = (
     f"{_SH}Coefficients",
 )  # or in half precision
 _COLUMNS = (f"{_SH}Degree", *_HALVES, *(f"{name}h" for name in _HALVES))
-# Attributes that say nothing about how gaussians look, or that are looked at elsewhere.
+# Attributes that do not affect the appearance of gaussians, or that other functions
+# read.
 _HINTS = ("projectionModeHint", "sortingModeHint")
 _KNOWN = (*_COLUMNS, *_HINTS, "extent", "visibility", "purpose", "xformOpOrder")
-_MAX_DEGREE = 3  # that is kept
+_MAX_DEGREE = 3  # coefficients of higher degrees are dropped
 _MOST_DEGREE = 100
 
 
@@ -310,7 +312,7 @@ def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]
 
 
 def _to_world(usd: ModuleType, prim: Usd.Prim) -> Floats:
-    # Transposed, because USD multiplies row vectors by matrices.
+    # The matrix is transposed, because USD multiplies row vectors by matrices.
     cache = usd.UsdGeom.XformCache(usd.Usd.TimeCode.EarliestTime())
     return np.transpose(np.array(cache.GetLocalToWorldTransform(prim)))
 
@@ -380,7 +382,7 @@ def _antialiased(prim: Usd.Prim) -> bool | None:
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
     """Return the SH degree of a prim; the default of the schema is 3."""
     degree = _value(usd, prim, f"{_SH}Degree")
-    if degree is None:  # then the prim has no coefficients either
+    if degree is None:  # a prim without a degree has no coefficients, either
         return 0
     if not isinstance(degree, int) or not 0 <= degree <= _MOST_DEGREE:
         raise ValueError(f"an invalid SH degree, {degree}, in {prim.GetPath()}")

@@ -114,7 +114,7 @@ class BuildConfig:
     # A fit with the largest value takes hours.
     steps: Annotated[int, (0, 1_000_000)] = 600
     first_steps: Annotated[int, (0, 1_000_000)] = 150
-    # Bounded because a step cannot be interrupted.
+    # The limit exists because a step cannot be interrupted.
     views_per_step: Annotated[int, (1, 1024)] = 2
     # All views are drawn before the first step.
     num_views: Annotated[int, (0, 1 << 16)] = 64
@@ -321,4 +321,4 @@ class BuildConfig:
             final_step=1.0,
             beta2=0.999,
         )
-        return replace(config, **changes)  # type: ignore[arg-type]  # types are checked as it is made
+        return replace(config, **changes)  # type: ignore[arg-type]  # the constructor checks types

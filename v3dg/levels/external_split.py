@@ -86,7 +86,8 @@ def _longest_axis(source: WordFile, first: int, last: int) -> int:
         means = points[:, :3].view(np.float32)
         low = np.minimum(low, means.min(axis=0))
         high = np.maximum(high, means.max(axis=0))
-    # As in the core: float32 lengths, and of equal sides the first.
+    # The core, too, compares float32 lengths and takes the first of several equal
+    # sides.
     return int(np.argmax(high - low))
 
 

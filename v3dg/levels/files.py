@@ -162,7 +162,7 @@ class _FileBuild:
         with source as leaves:
             config = leaves.settings(self.config)
             if resume and self._is_finished(leaves, config):
-                # RuntimeError: another build is writing there.
+                # A RuntimeError means that another build is writing this file.
                 with suppress(RuntimeError):
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
@@ -222,10 +222,11 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
-    """Return the file in which `build_file` builds the bundle, and from which an
-    interrupted build continues."""
+    """Return the path of the unfinished bundle, which `build_file` writes and from
+    which an interrupted build continues."""
     path = Path(bundle_path)
-    # The new file replaces the link's target, so it is beside that.
+    # The finished bundle replaces the target of a link, so the unfinished one is beside
+    # the target.
     if path.is_symlink():
         path = Path(os.path.realpath(path))
     return path.with_name(path.name + ".partial")

@@ -160,6 +160,8 @@ class Tally:
             is_allowed,
             f"only gaussians that can be drawn, but {text}; unusable='drop' leaves them out",
         )
-        check("asset", self.num_drawable, f"at least one gaussian that can be drawn, but {text}")
+        check(
+            "asset", self.num_drawable, f"at least one gaussian that can be drawn, got none: {text}"
+        )
         if self.num_wrong:
             warnings.warn(f"asset: {text}; they are left out", cleaning.AssetWarning, stacklevel=4)

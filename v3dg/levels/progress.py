@@ -21,7 +21,7 @@ class Bar(_progress.Bar):
         super().__init__(total, "build", progress, initial=initial)
         self._last_level = len(plan.levels) - 1
         self._initial = initial
-        # Fitted gaussians, by part and lowest level.
+        # Number of fitted gaussians, by part and by the lowest level of a fit.
         self._fitted: dict[tuple[int, int], float] = {}
         self._lock = threading.Lock()
         self._is_stopped = False

@@ -23,11 +23,11 @@ from v3dg.levels.rows import RUN_ROWS, in_runs
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
-# Step sizes of a refinement as a fraction of those of a fit. It is small because
-# refinement starts from fitted levels.
+# Step sizes of a refinement as a fraction of those of a fit. The fraction is small,
+# because a refinement starts from fitted levels.
 _RATE = 0.2
-# Default share of the visibility of a level that may be dropped, together with the
-# least visible gaussians.
+# Default share of a level's visibility that may be lost by dropping its least visible
+# gaussians.
 DROP = 0.02
 # Number of pictures that measure how visible each gaussian is.
 _NUM_WEIGHING_PICTURES = 2_000

@@ -7,16 +7,21 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels.plan import Offsets
 
 RUN_ROWS = 32
-"""Neighbouring gaussians that stand one after another, counted from the first one of a
-cluster: as many as a warp of a GPU works on at once."""
+"""Number of gaussians in a run. Gaussians in a run are close together in space. A warp
+of a GPU processes a run at once."""
 
 
 def in_runs(gaussians: Gaussians, offset: Offsets) -> Gaussians:
-    """Return the gaussians of clusters, with boundaries `offset` (C + 1,), such that
-    each run of RUN_ROWS of a cluster is a part of its median split; on the device of
-    the gaussians.
+    """Order the gaussians of each cluster such that every run of RUN_ROWS gaussians is
+    a part of the cluster's median split.
 
-    Gaussians that are in this order already keep it.
+    Gaussians that already have this order keep it.
+
+    Args:
+        offset: (C + 1,) boundaries of the clusters' gaussians.
+
+    Returns:
+        The gaussians on their device, in the new order.
     """
     largest = int(np.diff(offset).max(initial=0))
     depth = _core.num_halvings(-(-largest // RUN_ROWS), 1)

@@ -29,7 +29,7 @@ class LevelTables:
     bundle follow from the plan."""
 
     box: npt.NDArray[np.float32]  # (C, 2, 3), boxes around the drawn clusters
-    # (G, 4) balls for selection, each of which contains those below it.
+    # (G, 4) balls for the selection. Each ball contains those of the groups below.
     ball: npt.NDArray[np.float32]
     # (G, 4) smallest balls around groups, which the views of the fit show
     fit_ball: npt.NDArray[np.float32]

@@ -16,8 +16,8 @@ from v3dg.levels.simplify import LevelBuilder
 # without a filter.
 _GROUPS = 32
 _FILTER_PX2 = 0.05
-# Maximum number of leaves in one of these groups; fitting larger ones would take too
-# long.
+# Maximum number of leaves in a group that is fitted twice; fitting larger groups would
+# take too long.
 _MOST_LEAVES = 1 << 15
 # An asset needs the filter if its loss without the filter is larger by this factor
 # (docs/levels.md).

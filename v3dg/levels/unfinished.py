@@ -235,7 +235,8 @@ class Unfinished:
             try:
                 self._plan.write_header(descriptor)
             except OSError:
-                # This works on a full disk, because it overwrites existing bytes.
+                # Writing the head works on a full disk, because it overwrites existing
+                # bytes.
                 os.pwrite(descriptor, self.pages.head, 0)
                 raise
             self.is_whole = True
@@ -308,8 +309,8 @@ def discard_levels(resume_path: str | os.PathLike[str]) -> None:
 
     Raises:
         ValueError: The file is of another kind; it is not removed.
-        RuntimeError: A build is using it.
-        OSError: It cannot be removed.
+        RuntimeError: A build is using the file.
+        OSError: The file cannot be removed.
     """
     if os.path.lexists(resume_path):
         with _open_locked(resume_path) as file:
@@ -333,8 +334,8 @@ def _is_bundle(path: str | os.PathLike[str]) -> bool:
 def _open_locked(path: str | os.PathLike[str]) -> FileIO:
     """Open or create a file for reading and writing, locked against other builds until
     it is closed."""
-    # With O_NONBLOCK, opening a pipe does not wait for a writer; regular files ignore
-    # it.
+    # With O_NONBLOCK, opening a pipe does not wait for a writer. The flag has no effect
+    # on regular files.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
     while True:
         check(
@@ -351,8 +352,8 @@ def _open_locked(path: str | os.PathLike[str]) -> FileIO:
                 "an ordinary file, got a device or a pipe; choose another path",
             )
             lock(file.fileno(), path)
-            # The process that held the lock before may have removed the file; then open
-            # it again.
+            # The process that held the lock before may have removed the file. In this
+            # case it is opened again.
             with suppress(FileNotFoundError):
                 if os.path.samestat(status, os.lstat(path)):
                     return file

@@ -35,14 +35,14 @@ from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 
-# Number of leaves in a unit: enough to keep a GPU busy, at little memory. The last bits
-# of a bundle depend on it.
+# Number of leaves in a unit: enough to keep a GPU busy, with little memory. The last
+# bits of a bundle depend on this number.
 UNIT_LEAVES = 1 << 20
 # Factor by which the balls of level 1 grow if a smooth asset is too large to be
 # measured. Level 1 is then selected at half the size (docs/levels.md).
 _UNMEASURED = 2.0
-# Number of units that a GPU processes at once, so that it is not idle while one of them
-# is at its smallest levels.
+# Number of units that a GPU processes at once, so that the GPU is not idle while a unit
+# builds its smallest levels.
 _UNITS_ON_GPU = 4
 
 _Levels = dict[int, FinishedLevel]
@@ -174,7 +174,8 @@ class _Build:
         if runs:
             first = self.config.target_of(self.num_low)
         lower_levels: dict[int, Level] = {}
-        # The levels above the units are fitted to these levels and start from them.
+        # The levels above the units are fitted to these levels of the units, and start
+        # from them.
         for n in range(first, self.num_low):
             gaussians = _device.place(self._level(n).gaussians, devices[0])
             lower_levels[n] = Level(gaussians, finished[n].tables)
@@ -316,7 +317,7 @@ class UnitTask:
 
     leaves: Callable[[], Gaussians]
     builder: LevelBuilder
-    runs: Sequence[PageRun]  # pages of its levels
+    runs: Sequence[PageRun]  # pages of the unit's levels
     finished: Mapping[int, FinishedLevel]  # levels that are already built
     pages: PageFile | MemoryStore
 

@@ -7,6 +7,7 @@ frames and chooses one. `request.py` defines the requests.
 """
 
 from v3dg.render.api import first_camera, render
+from v3dg.render.batch import BatchPlanes, RenderedBatch
 from v3dg.render.frame import Frame, FrameSource, frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.renderer import Renderer
@@ -20,12 +21,14 @@ from v3dg.render.request import (
 
 __all__ = [
     "DEFAULT_MIN_TRANSMITTANCE",
+    "BatchPlanes",
     "CutRequest",
     "Frame",
     "FrameRequest",
     "FrameSource",
     "Look",
     "PoolFrame",
+    "RenderedBatch",
     "Renderer",
     "first_camera",
     "frame_of",

@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 
-from v3dg import _device
+from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import check, one_of, vector, whole
+from v3dg.camera_batch import CameraBatch
 from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
@@ -17,9 +18,11 @@ from v3dg.image import RenderedImage
 from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
+from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
+from v3dg.render.scene_frame import SceneFrame
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
@@ -29,6 +32,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from typing_extensions import Unpack
+
+
+_MOST_PIXELS_A_CALL = 1 << 22
 
 
 class _Options(CutOptions, total=False):
@@ -82,10 +88,12 @@ def render(
         subject: What to draw, in world space; or its file, which every call opens
             again.
         camera: Camera of any model. With several, each has its own cut and its own
-            picture, as if drawn alone. The two eyes of a stereo camera share one cut
-            and one frame. Their two pictures have common statistics, which are sums,
-            except for the number of selected gaussians. None means the first camera of
-            a scene's file, else the camera of `first_camera`.
+            picture, as if drawn alone; pinholes of one size and one near plane are
+            drawn at once, unless there is a budget, a cut or a pool (docs/sensors.md).
+            The two eyes of a stereo camera share one cut and one frame. Their two
+            pictures have common statistics, which are sums, except for the number of
+            selected gaussians. None means the first camera of a scene's file, else the
+            camera of `first_camera`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -128,10 +136,35 @@ def render(
         request = FrameRequest(view, cut_request, shade, cut)
         return frame.chosen(opened_subject).draw_settled(opened_subject, request)
 
+    if isinstance(camera, list | tuple) and cut is None and budget is None and are_alike(camera):
+        scene_frame = frame.chosen(opened_subject)
+        if isinstance(scene_frame, SceneFrame):
+            return _pictures_at_once(scene_frame, opened_subject, camera, cut_request, shade)
     pictures: Picture | list[Picture] = for_each(camera, picture)
     return cast(
         "RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures
     )
+
+
+def _pictures_at_once(
+    frame: SceneFrame,
+    subject: Subject,
+    cameras: Sequence[Camera],
+    cut: CutRequest,
+    shade: _core.Shade,
+) -> list[RenderedImage]:
+    """Return pictures that are drawn as batches: all by one call on a CUDA device; on
+    the CPU a few at a time, so that the program can be interrupted."""
+    first = cameras[0]
+    size = len(cameras)
+    if not frame.device.is_cuda:
+        size = max(1, _MOST_PIXELS_A_CALL // (first.width * first.height))
+    pictures: list[RenderedImage] = []
+    for begin in range(0, len(cameras), size):
+        part = CameraBatch.of(cameras[begin : begin + size])
+        batch = frame.draw_batch(subject, BatchRequest(part, cut, shade, None))
+        pictures += [batch[number] for number in range(len(part))]
+    return pictures
 
 
 def first_camera(
@@ -186,7 +219,7 @@ def _still_frame(
     subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
 ) -> FrameSource:
     """Return the frame for single pictures of a subject. The frame of a scene or of a
-    bundle is stored with it.
+    bundle is stored with the subject.
 
     Frames that differ only in `color_by` share a pool. If the size of the pool is
     given, only the last pool is kept.

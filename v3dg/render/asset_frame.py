@@ -26,7 +26,7 @@ class AssetFrame:
 
     Attributes:
         device: The device that draws.
-        memory: None, because it has no pool.
+        memory: None, because an asset needs no pool.
     """
 
     def __init__(self, asset: Gaussians, color_by: ColorBy, device: Device) -> None:
@@ -96,7 +96,7 @@ def check_request(request: CutRequest) -> None:
 def _check(tolerance: float | None, budget: int | None, min_level: int, fade: float | None) -> None:
     for name, value in (("budget", budget), ("min_level", min_level)):
         check(name, not value, "no value for an asset, which has no levels, got one; leave it out")
-    CutRequest(tolerance=tolerance, fade=fade).rule  # noqa: B018 - which checks them
+    CutRequest(tolerance=tolerance, fade=fade).rule  # noqa: B018 - the property checks the values
 
 
 _check_known = lru_cache(64, typed=True)(_check)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, overload
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import real
+from v3dg.camera_batch import CameraBatch
 from v3dg.cameras import Camera, StereoCamera, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
@@ -14,9 +15,11 @@ from v3dg.image import RenderedImage
 from v3dg.levels.memory import in_mib, pool_bytes
 from v3dg.opening import File, opened
 from v3dg.pool import PoolSlot
+from v3dg.render.batch import BatchPlanes, BatchRequest, RenderedBatch, check_planes
 from v3dg.render.frame import frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
+from v3dg.render.scene_frame import SceneFrame
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
 
@@ -84,6 +87,7 @@ class Renderer:
             self._subject, color_by, _device.resolve(device), pool_bytes(memory), PoolSlot()
         )
         self._steps = _core.BudgetSteps()
+        self._has_drawn_batch = False
 
     @property
     def memory(self) -> int | None:
@@ -139,6 +143,65 @@ class Renderer:
         request = FrameRequest(camera, cut_request, shade, cut)
         return self._frame.chosen(subject).draw(subject, request, self._steps)
 
+    def render_batch(
+        self,
+        cameras: CameraBatch | Sequence[Camera],
+        *,
+        tolerance: float | None = None,
+        min_level: int = 0,
+        fade: float | None = None,
+        background: Sequence[float] = BLACK,
+        min_transmittance: float | None = None,
+        depth: bool = False,
+        out: BatchPlanes | None = None,
+    ) -> RenderedBatch:
+        """Draw a picture for each of many cameras of one size by one call, with the
+        decisions and the pixels of pictures that are drawn one by one.
+
+        On a CUDA device the number of kernels does not depend on the number of cameras,
+        nothing is copied to the host, and the call returns when its work is queued on
+        torch's current stream. Cameras whose tensors are on the device are read when
+        the work runs; so a captured CUDA graph draws what they contain at its replay. A
+        batch that does not fit into the memory is drawn in parts. On the CPU, each
+        thread draws a camera.
+
+        Buffers grow to what batches need. If they were too small for this one, its
+        pictures are NaN until an attribute of the result, or `wait`, draws them again;
+        a renderer's first batch waits for that itself.
+
+        Args:
+            cameras: The cameras; `Camera`s of one size and one near plane are also
+                accepted.
+            tolerance: As in `v3dg.select`; so are `min_level` and `fade`. A batch has
+                no budget.
+            background: As in `v3dg.render`; so are `min_transmittance` and `depth`.
+            out: Where to write; None for new arrays of colour, alpha and, if requested,
+                depth. They belong to the caller, and are valid once the result was read
+                or, on the same stream, once the buffers have their size.
+
+        Raises:
+            ValueError: An argument is invalid; if it is a camera, the message has its
+                index. The renderer draws an asset, or from a pool.
+        """
+        if not isinstance(cameras, CameraBatch):
+            cameras = CameraBatch.of(cameras)
+        check_planes(out, with_depth=depth)
+        subject = self._subject
+        shade = shade_of(background, min_transmittance, is_asset=False, depth=depth)
+        cut = CutRequest(tolerance, None, min_level, fade)
+        frame = self._frame.chosen(subject)
+        if not isinstance(frame, SceneFrame):
+            raise ValueError(
+                "renderer: a batch needs a scene or a bundle that is resident as a whole; "
+                "give memory=None"
+            )
+        request = BatchRequest(cameras, cut, shade, out)
+        batch = frame.draw_batch(subject, request)
+        if not self._has_drawn_batch:
+            batch.wait()
+            self._has_drawn_batch = True
+        return batch
+
     def settle(
         self,
         camera: Camera | StereoCamera,
@@ -169,5 +232,5 @@ class Renderer:
         """
         real(timeout, "timeout", "seconds, at least 0", 0)
         cut = CutRequest(tolerance, budget, min_level, fade)
-        cut.rule  # noqa: B018 - which checks it
+        cut.rule  # noqa: B018 - the property checks the values
         self._frame.chosen(self._subject).settle(self._subject, camera, cut, timeout)

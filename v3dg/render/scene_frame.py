@@ -12,6 +12,7 @@ from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Array
 from v3dg.image import RenderedImage, Stats
+from v3dg.render.batch import BatchRequest, RenderedBatch, draw_batch
 from v3dg.render.picture import Picture, picture_of, stats_of
 from v3dg.render.request import CutRequest, FrameRequest
 from v3dg.residency import ResidentScene, residency
@@ -31,7 +32,7 @@ class SceneFrame:
 
     Attributes:
         device: The device that draws.
-        memory: None, because it has no pool.
+        memory: None, because this frame has no pool.
         num_bundles: Number of the scene's bundles whose gaussians are on the device. A
             scene never removes bundles.
     """
@@ -98,6 +99,14 @@ class SceneFrame:
         return picture_of(drawing, camera, finish)
 
     draw_settled = draw
+
+    def draw_batch(self, subject: Subject, request: BatchRequest) -> RenderedBatch:
+        """Draw a picture for each camera of a batch."""
+        with residency.turn(self.device):
+            resident = residency.scene(subject, self.device, self._resident)
+            self._resident = resident
+            self.take(resident)
+            return draw_batch(self.core, resident, self.device, request)
 
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float

@@ -31,8 +31,11 @@ class Columns(NamedTuple):
     importance: npt.NDArray[np.float32]
     opacity: npt.NDArray[np.float32]
     tint: npt.NDArray[np.float32]
+    environments: npt.NDArray[np.int32]
 
 
+SHARED = -1  # as an instance's environment: all cameras see it
+MOST_ENVIRONMENT = (1 << 24) - 1
 _ROW = {
     "positions": (3,),
     "quaternions": (4,),
@@ -56,9 +59,11 @@ def columns_of(
     positions: Array | npt.ArrayLike | None,
     quaternions: Array | npt.ArrayLike | None,
     scales: Array | npt.ArrayLike | None,
+    *,
     importance: npt.ArrayLike,
     opacity: npt.ArrayLike,
     tint: npt.ArrayLike,
+    environment: npt.ArrayLike,
 ) -> Columns:
     """Return checked columns; the number of positions is the number of instances."""
     points = _points_of(positions)
@@ -70,6 +75,7 @@ def columns_of(
         importance=column(importance, "importance", count),
         opacity=column(opacity, "opacity", count),
         tint=column(tint, "tint", count),
+        environments=environment_column(environment, count),
     )
 
 
@@ -78,7 +84,7 @@ def composed(outer: Columns, inner: Columns) -> Columns:
     pose."""
     size = outer.scales[0]
     rotation = rotation_from_quaternion(outer.quaternions[0])
-    # Columns_of() rejects invalid results.
+    # `columns_of` rejects invalid results.
     with np.errstate(over="ignore", under="ignore"):
         return columns_of(
             positions=size * inner.positions @ rotation.T + outer.positions,
@@ -87,6 +93,7 @@ def composed(outer: Columns, inner: Columns) -> Columns:
             importance=outer.importance * inner.importance,
             opacity=outer.opacity * inner.opacity,
             tint=outer.tint * inner.tint,
+            environment=np.where(outer.environments < 0, inner.environments, outer.environments),
         )
 
 
@@ -117,7 +124,7 @@ def parts_of(matrix: Array | npt.ArrayLike, *parts: Array | npt.ArrayLike | None
 
 
 def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
-    """Return the rotations (I, 4) of instances after turning the up axis of their
+    """Return the rotations (I, 4) of instances after rotating the up axis of their
     bundles to another axis. `bundles` has one bundle for all instances, or I."""
     one_of(up, "up", AXES)
     turns = {bundle: turn_between(up_of_bundle(bundle), up) for bundle in set(bundles)}
@@ -172,6 +179,20 @@ def column(values: Array | None, name: str, count: int) -> Array:
     return np.ascontiguousarray(array, np.float64)
 
 
+def environment_column(values: npt.ArrayLike, count: int) -> npt.NDArray[np.int32]:
+    """Return the environments (count,) of instances; a single one stands for all."""
+    array = np.asarray(values)
+    expected = f"whole numbers, one for all or {count}"
+    fits = array.dtype.kind in "iu" and array.shape in ((), (count,))
+    check("environment", fits, f"{expected}, got {array.dtype} of shape {array.shape}")
+    wrong = (array < SHARED) | (array > MOST_ENVIRONMENT)
+    if wrong.any():
+        raise ValueError(
+            f"environment: expected {SHARED} to {MOST_ENVIRONMENT}, got {array[wrong][0]}"
+        )
+    return np.array(np.broadcast_to(array, count), np.int32)
+
+
 def on_device_of(array: Array, values: Array) -> Array:
     """Return the values as a tensor on the device of ``array``; return them unchanged
     if ``array`` is a NumPy array."""
@@ -200,12 +221,26 @@ def joined(first: Array, second: Array) -> Array:
     return _device.library_of(first).concatenate([first, second])
 
 
-def replaced(values: Array, rows: npt.NDArray[np.int64], row_values: Array) -> Array:
+def replaced(values: Array, rows: Array, row_values: Array) -> Array:
     """Return a copy of an array in which some rows are replaced."""
     values, row_values = _on_one_device(values, row_values)
     if isinstance(values, np.ndarray):
         values = values.copy()
+    elif getattr(rows, "is_cuda", False):
+        return _replaced_on_device(values, rows, row_values)
     else:
         values = values.clone()
     values[on_device_of(values, rows)] = row_values
     return values
+
+
+def _replaced_on_device(values: Array, rows: Array, row_values: Array) -> Array:
+    """Do the work of `replaced` without waiting for the device. Rows that do not exist
+    are ignored: they go to a row behind the last one."""
+    import torch
+
+    count = len(values)
+    exists = (rows >= 0) & (rows < count)
+    padded = torch.cat([values, values.new_zeros((1, *values.shape[1:]))])
+    padded.index_copy_(0, torch.where(exists, rows, count).to(torch.int64), row_values)
+    return padded[:count]

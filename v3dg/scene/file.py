@@ -19,6 +19,7 @@ from v3dg.cameras import DEFAULT_FOV_X, LENS_MODELS, Axis, Camera, LensModel, ch
 from v3dg.io import SUFFIXES
 from v3dg.rotations import normalised, product, similarity_of
 from v3dg.scene import Scene
+from v3dg.scene.columns import MOST_ENVIRONMENT, SHARED
 from v3dg.scene.scene import turn_of
 
 FORMAT = "v3dg-scene"
@@ -46,6 +47,7 @@ class _Instance(NamedTuple):
     importance: float
     opacity: float
     tint: list[float]
+    environment: int
     node: Node | None
 
 
@@ -228,6 +230,8 @@ def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]
         instances[number]["opacity"] = scene.opacity[number].item()
     for number in np.flatnonzero((scene.tint != 1).any(axis=1)).tolist():
         instances[number]["tint"] = scene.tint[number].tolist()
+    for number in np.flatnonzero(scene.environments != SHARED).tolist():
+        instances[number]["environment"] = scene.environments[number].item()
     return instances
 
 
@@ -277,13 +281,13 @@ def _subjects_of(
 
 
 _POSE = ("position", "quaternion", "scale")
+_FACTORS = ("importance", "opacity", "tint", "environment")
 
 
 def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
     """Return an instance in a scene file. If it has the field `up`, the up axis of the
     scene is set to that axis."""
-    optional = ("bundle", "scene", *_POSE, "matrix", "up", "importance", "opacity", "tint")
-    fields = node.fields((), optional)
+    fields = node.fields((), ("bundle", "scene", *_POSE, "matrix", "up", *_FACTORS))
     if ("bundle" in fields) == ("scene" in fields):
         raise node.error("exactly one of the fields bundle and scene")
     if "matrix" not in fields:
@@ -337,6 +341,7 @@ def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
                 instance.importance,
                 opacity=instance.opacity,
                 tint=instance.tint,
+                environment=instance.environment,
             )
 
 
@@ -344,8 +349,17 @@ def _add_bundles(scene: Scene, instances: Sequence[_Instance]) -> None:
     if not instances:
         return
     columns = zip(*instances, strict=True)
-    subjects, positions, quaternions, scales, importance, opacity, tint, _ = columns
-    scene.add(subjects, positions, quaternions, scales, importance, opacity=opacity, tint=tint)
+    subjects, positions, quaternions, scales, importance, opacity, tint, environment, _ = columns
+    scene.add(
+        subjects,
+        positions,
+        quaternions,
+        scales,
+        importance,
+        opacity=opacity,
+        tint=tint,
+        environment=environment,
+    )
 
 
 def _read_cameras(nodes: Node) -> dict[str, Camera]:
@@ -368,6 +382,7 @@ def _instance(node: Node, subject: Bundle | Scene, fields: Mapping[str, Node]) -
     importance = 1.0
     opacity = 1.0
     tint = [1.0, 1.0, 1.0]
+    environment = SHARED
     if "matrix" in fields:
         position, quaternion, scale = _pose_of(fields["matrix"])
     if "position" in fields:
@@ -382,10 +397,14 @@ def _instance(node: Node, subject: Bundle | Scene, fields: Mapping[str, Node]) -
         opacity = _opacity(fields["opacity"])
     if "tint" in fields:
         tint = _tint(fields["tint"])
+    if "environment" in fields:
+        environment = _environment(fields["environment"])
     place: Node | None = None
     if isinstance(subject, Scene):
         place = node
-    return _Instance(subject, position, quaternion, scale, importance, opacity, tint, place)
+    return _Instance(
+        subject, position, quaternion, scale, importance, opacity, tint, environment, place
+    )
 
 
 def _pose_of(node: Node) -> tuple[list[float], list[float], float]:
@@ -402,6 +421,13 @@ def _opacity(node: Node) -> float:
     if not 0 <= opacity <= 1:
         raise node.error("a number from 0 to 1")
     return opacity
+
+
+def _environment(node: Node) -> int:
+    environment = node.number()
+    if environment != int(environment) or not SHARED <= environment <= MOST_ENVIRONMENT:
+        raise node.error(f"a whole number from {SHARED} to {MOST_ENVIRONMENT}")
+    return int(environment)
 
 
 def _tint(node: Node) -> list[float]:

@@ -16,10 +16,12 @@ from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Array, Gaussians
 from v3dg.rotations import normalised, product, rotation_from_quaternion, turn_between
 from v3dg.scene.columns import (
+    SHARED,
     Columns,
     column,
     columns_of,
     composed,
+    environment_column,
     joined,
     on_device_of,
     parts_of,
@@ -28,8 +30,8 @@ from v3dg.scene.columns import (
     up_of_bundle,
 )
 
-# Held during every change of a scene, and during fork(), so that it is never locked in
-# a child process.
+# This lock is held during every change of a scene, and during fork(), so that it is
+# never locked in a child process.
 _lock = threading.RLock()
 os.register_at_fork(
     before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release
@@ -44,6 +46,7 @@ class _State(NamedTuple):
     importance: npt.NDArray[np.float32]
     opacity: npt.NDArray[np.float32]
     tint: npt.NDArray[np.float32]
+    environments: npt.NDArray[np.int32]
     positions: Array  # poses are NumPy arrays, or tensors on a CUDA device
     quaternions: Array
     scales: Array
@@ -51,9 +54,8 @@ class _State(NamedTuple):
 
 
 class Scene:
-    """A set of instances of bundles. Each bundle is stored once; an instance transforms
-    its points by p -> scale
-    * rotation p + position.
+    """A set of instances of bundles. Each bundle is stored once. An instance transforms
+    its points p to scale * rotation p + position.
 
     Instances are numbered from 0 in the order in which they were added; after `remove`,
     the remaining ones are renumbered. Changes are visible in the next picture. Several
@@ -74,6 +76,7 @@ class Scene:
             importance=np.zeros(0, np.float32),
             opacity=np.zeros(0, np.float32),
             tint=np.zeros((0, 3), np.float32),
+            environments=np.zeros(0, np.int32),
             positions=np.zeros((0, 3)),
             quaternions=np.zeros((0, 4)),
             scales=np.zeros(0),
@@ -124,6 +127,7 @@ class Scene:
         up: Axis | None = None,
         opacity: npt.ArrayLike = 1.0,
         tint: npt.ArrayLike = (1.0, 1.0, 1.0),
+        environment: npt.ArrayLike = SHARED,
     ) -> range:
         """Add I instances of a bundle and return their ids.
 
@@ -141,12 +145,15 @@ class Scene:
                 quaternions and scales: transforms of column vectors, composed of
                 rotation, translation and uniform scale.
             up: The axis that points up in the scene. The up axis of the bundle
-                (declared in its file, otherwise -y) is turned to this axis before the
+                (declared in its file, otherwise -y) is rotated to this axis before the
                 pose is applied. If the scene's `up` is None, it is set to this axis.
             opacity: (I,), or one number for all instances, 0 to 1: factor of the
                 opacities of gaussians. Instances with opacity 0 are skipped.
             tint: (I, 3), or (3,) for all instances, >= 0: factors of red, green and
                 blue. They multiply the evaluated colours, after these are clamped at 0.
+            environment: (I,) or one whole number for all, 0 to 2^24 - 1: the cameras of
+                that environment see the instance (see `CameraBatch.environments`); -1:
+                those of all do. Pictures of a single `Camera` show all instances.
 
         Raises:
             TypeError: ``bundle`` is not a Bundle.
@@ -156,7 +163,15 @@ class Scene:
         bundles = _bundles_of(bundle)
         if matrix is not None:
             positions, quaternions, scales = parts_of(matrix, positions, quaternions, scales)
-        rows = columns_of(positions, quaternions, scales, importance, opacity, tint)
+        rows = columns_of(
+            positions,
+            quaternions,
+            scales,
+            importance=importance,
+            opacity=opacity,
+            tint=tint,
+            environment=environment,
+        )
         count = len(rows.importance)
         if isinstance(bundle, list | tuple):
             check(
@@ -180,13 +195,15 @@ class Scene:
         up: Axis | None = None,
         opacity: float = 1.0,
         tint: npt.ArrayLike = (1.0, 1.0, 1.0),
+        environment: int = SHARED,
     ) -> range:
         """Add all instances of another scene, placed as a whole, and return their ids
         in this scene.
 
-        Poses are composed; importance, opacity and tint are multiplied. Later changes
-        of the other scene have no effect. The arguments are those of `add` for one
-        instance. If the other scene's `up` is None, z is used.
+        Poses are composed; importance, opacity and tint are multiplied; an environment
+        replaces those of the other scene. Later changes of the other scene have no
+        effect. The arguments are those of `add` for one instance. If the other scene's
+        `up` is None, z is used.
 
         Raises:
             TypeError: ``scene`` is not a Scene.
@@ -202,25 +219,21 @@ class Scene:
         parts: tuple[Array, Array, Array] = (position, quaternion, scale)
         if matrix is not None:
             parts = parts_of(matrix, *parts)
-        outer = columns_of(*parts, importance, opacity, tint)
-        check("position", len(outer.importance) == 1, f"one position, got {len(outer.importance)}")
+        outer = columns_of(
+            *parts, importance=importance, opacity=opacity, tint=tint, environment=environment
+        )
+        count = len(outer.importance)
+        check("scene", count == 1, f"one pose for the added scene, got {count} poses")
         inner = copy.copy(scene)  # other threads may change the original meanwhile
         if up is not None:
             turned_quaternions = product(outer.quaternions, turn_of(inner, up))
             outer = outer._replace(quaternions=turned_quaternions)
-        columns = Columns(
-            positions=inner.positions,
-            quaternions=inner.quaternions,
-            scales=inner.scales,
-            importance=inner.importance,
-            opacity=inner.opacity,
-            tint=inner.tint,
-        )
         bundles = [inner.bundles[number] for number in inner.instance_bundle]
-        return self._append(bundles, composed(outer, columns), up)
+        return self._append(bundles, composed(outer, _columns_of(inner)), up)
 
     def _append(self, bundles: Sequence[Bundle], rows: Columns, up: Axis | None) -> range:
-        """Append instances of one bundle, or of one bundle each; return their ids."""
+        """Append instances; `bundles` has one bundle for all of them, or one for each.
+        Return their ids."""
         count = len(rows.importance)
         with _lock:
             self._take_up(up)
@@ -238,6 +251,7 @@ class Scene:
                 importance=joined(state.importance, rows.importance),
                 opacity=joined(state.opacity, rows.opacity),
                 tint=joined(state.tint, rows.tint),
+                environments=joined(state.environments, rows.environments),
             )
             self._publish(state, changes=1)
         return range(first, first + count)
@@ -253,6 +267,7 @@ class Scene:
                 importance=state.importance[is_left],
                 opacity=state.opacity[is_left],
                 tint=state.tint[is_left],
+                environments=state.environments[is_left],
                 positions=state.positions[on_device_of(state.positions, is_left)],
                 quaternions=state.quaternions[on_device_of(state.quaternions, is_left)],
                 scales=state.scales[on_device_of(state.scales, is_left)],
@@ -272,14 +287,16 @@ class Scene:
         """Change the poses of instances. Parts that are None do not change.
 
         Args:
-            ids: (M,) indices of the instances; None means all.
+            ids: (M,) indices of the instances; None means all. A tensor on the CUDA
+                device of the poses is read there without waiting, and not checked: ids
+                that do not exist are ignored, and of equal ones any pose counts.
             positions: (M, 3) new positions.
             quaternions: (M, 4), or (4,) for all of them: new rotations.
             scales: (M,), or one number for all of them: new scales.
             matrix: (M, 4, 4), or (4, 4) for one instance, instead of positions,
                 quaternions and scales.
             up: As in `add`; requires new quaternions or matrices. The up axis of the
-                bundles is turned to this axis before the new rotation is applied.
+                bundles is rotated to this axis before the new rotation is applied.
 
         Raises:
             IndexError: There is no such instance.
@@ -295,9 +312,10 @@ class Scene:
             )
         parts = {"positions": positions, "quaternions": quaternions, "scales": scales}
         with _lock:
-            rows = self._ids(ids)
-            self._take_up(up)
             state = self._state
+            rows = self._rows(ids)
+            _check_rows_for_up(rows, up)
+            self._take_up(up)
             for name, part in parts.items():
                 if part is None:
                     continue
@@ -313,15 +331,29 @@ class Scene:
     def set_importance(
         self, importance: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None
     ) -> None:
-        """Change the importance of instances, see `add`; if ``ids`` is None, of all."""
+        """Change the importance of instances (see `add`); of all instances if ``ids``
+        is None."""
         self._set("importance", importance, ids)
 
     def set_opacity(self, opacity: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Change the opacity of instances, see `add`; if ``ids`` is None, of all."""
+        """Change the opacity of instances (see `add`); of all instances if ``ids`` is
+        None."""
         self._set("opacity", opacity, ids)
 
+    def set_environment(
+        self, environment: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None
+    ) -> None:
+        """Put instances into other environments, as in `add`; all of them if ``ids`` is
+        None."""
+        with _lock:
+            rows = self._ids(ids)
+            environments = self._state.environments.copy()
+            environments[rows] = environment_column(environment, len(rows))
+            self._publish(self._state._replace(environments=environments), changes=1)
+
     def set_tint(self, tint: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Change the tint of instances, see `add`; if ``ids`` is None, of all."""
+        """Change the tint of instances (see `add`); of all instances if ``ids`` is
+        None."""
         self._set("tint", tint, ids)
 
     def _set(self, name: str, values: npt.ArrayLike, ids: Array | npt.ArrayLike | None) -> None:
@@ -394,6 +426,12 @@ class Scene:
         return self._state.tint
 
     @property
+    def environments(self) -> npt.NDArray[np.int32]:
+        """(I,) int32, the environment of each instance, -1 for those of all; read-
+        only."""
+        return self._state.environments
+
+    @property
     def factors(self) -> npt.NDArray[np.float32] | None:
         """(I, 4) float32, factors of red, green, blue and opacity; None if all factors
         are 1."""
@@ -436,6 +474,17 @@ class Scene:
         state = self._state
         return state.positions, state.quaternions, state.scales
 
+    def _rows(self, ids: Array | npt.ArrayLike | None) -> Array:
+        """Return ids of instances for `move`: unchecked where they and the poses are on
+        a CUDA device, else checked."""
+        if getattr(ids, "is_cuda", False) and getattr(self._state.positions, "is_cuda", False):
+            tensor: Array = ids
+            kind = str(tensor.dtype)
+            fits = tensor.ndim == 1 and kind in ("torch.int32", "torch.int64")
+            check("ids", fits, f"whole numbers (M,), got {kind} of shape {tuple(tensor.shape)}")
+            return tensor
+        return self._ids(ids)
+
     def _ids(self, ids: Array | None) -> npt.NDArray[np.int64]:
         """Return checked indices of instances; all indices if `ids` is None."""
         count = len(self)
@@ -462,9 +511,29 @@ class Scene:
         return f"Scene({instances} of {num_bundles} bundle{'s' * (num_bundles != 1)})"
 
 
+def _columns_of(scene: Scene) -> Columns:
+    """Return the columns of all instances, on the host."""
+    return Columns(
+        positions=scene.positions,
+        quaternions=scene.quaternions,
+        scales=scene.scales,
+        importance=scene.importance,
+        opacity=scene.opacity,
+        tint=scene.tint,
+        environments=scene.environments,
+    )
+
+
+def _check_rows_for_up(rows: Array, up: Axis | None) -> None:
+    """Raise ValueError for rows on a device with an axis that is up: their bundles are
+    known on the host."""
+    is_on_host = isinstance(rows, np.ndarray)
+    check("ids", up is None or is_on_host, "ids on the host beside up, got some on a device")
+
+
 def turn_of(subject: Scene | Bundle, up: Axis) -> Floats:
-    """Return the quaternion (4,) w x y z that turns the up axis of a scene or a bundle
-    to another axis; raise ValueError for an invalid axis."""
+    """Return the quaternion (4,) w x y z that rotates the up axis of a scene or a
+    bundle to another axis; raise ValueError for an invalid axis."""
     one_of(up, "up", AXES)
     if isinstance(subject, Bundle):
         return turn_between(up_of_bundle(subject), up)

@@ -120,8 +120,8 @@ class Figures(msgspec.Struct):
 
     Attributes:
         gaussians_selected, gaussians_in_frustum, tolerance, select_ms, draw_ms, levels,
-            missing: See `v3dg.Stats`. memory_bytes: Memory of the viewer's process in
-            bytes.
+            missing: See `v3dg.Stats`.
+        memory_bytes: Memory of the viewer's process in bytes.
     """
 
     gaussians_selected: int

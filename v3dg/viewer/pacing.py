@@ -27,8 +27,8 @@ PAGES_SECONDS = 0.1
 # A draft that has taken this many seconds is abandoned when another picture is
 # requested.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
-# The width of the smallest draft as a fraction of the full width. If that is still too
-# slow, the tolerance is multiplied by up to the second number.
+# The width of the smallest draft as a fraction of the full width. If drawing this draft
+# is still too slow, the tolerance is multiplied by up to the second number.
 _SMALLEST = 1 / 4
 _COARSEST = 64.0
 # Sizes are rounded to this number of steps per factor of two, so that they do not
@@ -64,8 +64,8 @@ class Pacer:
     def draft(self, full: Size) -> Draft:
         """Return the draft for a picture of size ``full``.
 
-        The draft has about the same aspect ratio and is not larger. The first draft has
-        a quarter of the width.
+        The draft has about the same aspect ratio as ``full`` and is not larger. The
+        first draft has a quarter of the width.
         """
         whole = math.prod(full)
         share = (self._target_ms * self._work_per_ms or whole / 16) / whole

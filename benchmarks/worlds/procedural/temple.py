@@ -122,7 +122,7 @@ def _column(x: float, y: float) -> list[_Face]:
 
     def shaft(v: Array, u: Array) -> Array:
         angle = -2 * np.pi * u
-        # With entasis, the slight bulge of the shaft.
+        # The shaft has an entasis, a slight bulge.
         radius = _RADIUS * (1 - 0.22 * v + 0.035 * np.sin(np.pi * v))
         flute = np.abs(np.cos(10 * angle))  # 20 flutes that meet in sharp edges
         radius = radius * (1 - 0.055 * (1 - flute**2))

@@ -350,7 +350,7 @@ def _bark(
         spacing,
         colour,
         rng,
-        # Otherwise the bands would blur along the trunk.
+        # Bands across the trunk stay sharp if fewer gaussians are aligned along it.
         aligned=0.5 if shape.bands else 0.8,
         bend=radius,
     )

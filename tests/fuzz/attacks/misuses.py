@@ -260,6 +260,12 @@ def _calls(shared, work):
         renderer = v3dg.Renderer(scene, device="cpu")
         renderer.render(**values)
 
+    def drawn_as_batch(**values):
+        v3dg.Renderer(scene, device="cpu").render_batch(v3dg.CameraBatch(**values))
+
+    def drawn_at_once(**values):
+        v3dg.Renderer(scene, device="cpu").render_batch(**values)
+
     def tables(**values):
         kind = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
         mine = {
@@ -323,6 +329,33 @@ def _calls(shared, work):
                 "fov_x": 0.8,
                 **view,
             },
+        ),
+        "CameraBatch": (
+            drawn_as_batch,
+            {
+                "viewmats": np.stack([camera.viewmat] * 3),
+                "K": np.stack([camera.K] * 3),
+                "environments": np.array([-1, -1, -1]),
+                **view,
+            },
+        ),
+        "Renderer.render_batch": (
+            drawn_at_once,
+            {
+                "cameras": [camera, camera],
+                "tolerance": 1.0,
+                "min_level": 0,
+                "fade": 1.05,
+                "background": (0.0, 0.5, 1.0),
+                "depth": True,
+                "out": v3dg.BatchPlanes(
+                    np.zeros((2, 6, 8, 4), np.float32), None, np.zeros((2, 6, 8), np.float32)
+                ),
+            },
+        ),
+        "Scene.set_environment": (
+            changed("set_environment"),
+            {"environment": np.array([0, 3]), "ids": [0, 2]},
         ),
         "Clusters": (v3dg.Clusters, clusters),
         "Groups": (v3dg.Groups, groups),

@@ -60,6 +60,6 @@ def test_zero_quaternion_turns_nothing(device):
 def test_wrong_offsets_are_named(device, offset):
     g = scenes.gaussians(np.zeros((3, 3)))
     with pytest.raises(
-        ValueError, match="offset: expected ascending boundaries from 0 to 3, got others"
+        ValueError, match="offset: expected ascending boundaries from 0 to 3, got other numbers"
     ):
         bound_by_boxes(device, g, np.array(offset))

@@ -134,7 +134,7 @@ def test_a_model_decodes_clusters_in_any_order(device, sh_degree):
         values = np.concatenate([getattr(part, name) for part in expected])
         assert host(column).tobytes() == values.tobytes(), name
     assert len(model.decode(np.zeros(0, np.int32))[0]) == 0
-    with pytest.raises(IndexError, match="cluster_ids: expected ids below"):
+    with pytest.raises(IndexError, match="cluster_ids: expected ids of at least 0 and below"):
         model.decode(np.array([len(codes.clusters)], np.int32))
     with pytest.raises(ValueError, match="expected quantized gaussians"):
         residency.model(rows, _device.resolve(device)).decode(ids)
@@ -161,8 +161,8 @@ def test_every_instruction_set_draws_the_same_bits(isa, sh_degree, tmp_path):
     }
     command = [sys.executable, "-c", program, *map(str, paths)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    if "this processor has no" in done.stderr:
-        pytest.skip(f"this processor has no {isa}")
+    if "this processor does not support" in done.stderr:
+        pytest.skip(f"this processor does not support {isa}")
     assert done.returncode == 0, done.stderr
 
 

@@ -426,14 +426,17 @@ def test_no_groups_are_legal(device):
     ("change", "message"),
     [
         *(
-            (change, r"range: expected \[first, last\) within the gaussians, got another for")
+            (
+                change,
+                r"range: expected \[first, last\) within the gaussians, got numbers outside for",
+            )
             for change in ({"target_range": [[0, 11]]}, {"range": [[3, 2]]}, {"range": [[-1, 2]]})
         ),
         ({"target_range": [[0, 5], [5, 10]]}, "target_range: expected shape"),
         ({"stream": [0, 1]}, "stream: expected shape"),
         (
             {"ball": np.zeros((1, 4), np.float32)},
-            "ball: expected a positive radius, group 0 has none",
+            "ball: expected a positive radius, got none for group 0",
         ),
     ],
 )
@@ -460,7 +463,7 @@ def fit_one_group(start, target, change):
 
 
 def test_what_is_fitted_has_to_be_like_its_target():
-    message = "gaussians: expected the device and the SH degree of the target, got others"
+    message = "gaussians: expected the device and the SH degree of the target, got different ones"
     with pytest.raises(ValueError, match=message):
         fit_one_group(with_bases(in_ball(15, 10), 1), in_ball(15, 10), {})
 
@@ -474,7 +477,7 @@ def test_what_is_fitted_has_to_be_writable():
 
 @pytest.mark.gpu
 def test_what_is_fitted_has_to_be_where_its_target_is():
-    message = "gaussians: expected the device and the SH degree of the target, got others"
+    message = "gaussians: expected the device and the SH degree of the target, got different ones"
     there = on("cuda", in_ball(15, 10))
     with pytest.raises(ValueError, match=message):
         fit_one_group(in_ball(15, 10), there, {})

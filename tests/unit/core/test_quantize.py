@@ -239,7 +239,7 @@ def test_what_is_not_finite_is_refused(name, value):
     gaussians, offset = random_clusters(6, 1)
     getattr(gaussians, name).reshape(len(gaussians), -1)[7, -1] = value
     with pytest.raises(
-        ValueError, match="gaussians: expected finite values, got infinite or NaN ones at 7"
+        ValueError, match="gaussians: expected finite values, got infinite or NaN ones in row 7"
     ):
         _core.encode_page(gaussians.rows, offset)
 

@@ -211,16 +211,8 @@ def test_no_gaussians_give_none(device, method):
 @pytest.mark.parametrize(
     ("in_offset", "out_offset", "message"),
     [
-        (
-            [0, 3],
-            [0, 4],
-            "out_offset: expected 1 to the number in in_offset, segment 0 has another",
-        ),
-        (
-            [0, 3],
-            [0, 0],
-            "out_offset: expected 1 to the number in in_offset, segment 0 has another",
-        ),
+        ([0, 3], [0, 4], "out_offset: expected 1 to 3 gaussians in segment 0, got 4"),
+        ([0, 3], [0, 0], "out_offset: expected 1 to 3 gaussians in segment 0, got 0"),
         ([0, 2], [0, 1], "expected segments from 0"),
         ([1, 3], [0, 1], "expected segments from 0"),
         ([0, 3], [1, 2], "expected segments from 0"),

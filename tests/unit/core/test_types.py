@@ -227,12 +227,12 @@ def test_rows_of_mixed_types_are_refused(name):
         ({"quats": (5, 4)}, "quats: expected shape (4, 4), got (5, 4)"),
         ({"scales": (4, 1)}, "scales: expected shape (4, 3), got (4, 1)"),
         ({"opacities": (4, 1)}, "opacities: expected shape (4,), got (4, 1)"),
-        ({"sh": (4, 5, 3)}, "sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got (4, 5, 3)"),
+        ({"sh": (4, 5, 3)}, "sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got (4, 5, 3)"),
         (
             {"sh": (4, 25, 3)},
-            "sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got (4, 25, 3)",
+            "sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got (4, 25, 3)",
         ),
-        ({"sh": (4, 27)}, "sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got (4, 27)"),
+        ({"sh": (4, 27)}, "sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got (4, 27)"),
         ({"sh": (3, 9, 3)}, "sh: expected shape (4, 9, 3), got (3, 9, 3)"),
     ],
 )
@@ -324,7 +324,8 @@ def test_frame_refuses_a_scene_of_other_bundles():
             assert not frame.draw(*arguments).alpha.any()
             continue
         with pytest.raises(
-            ValueError, match="scene: expected a scene of the bundles whose gaussians the frame has"
+            ValueError,
+            match="scene: expected a scene of the bundles that the frame draws, got other",
         ):
             frame.draw(*arguments)
 

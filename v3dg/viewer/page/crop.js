@@ -18,7 +18,8 @@ import { edgesOf } from "./handles.js";
 const BOX_COLOR = "#5ad1ff";
 const HANDLE_RADIUS = 7;
 /**
- * The square of the smallest sine: a face cannot be dragged along an axis that points to the eye.
+ * Square of the smallest sine of the angle between an axis and the line of sight at which a face
+ * can be dragged along this axis.
  */
 const LEAST_SINE2 = 1e-3;
 const LOCAL_AXES = [AXES.x, AXES.y, AXES.z];

@@ -1,0 +1,198 @@
+"""Many small cameras among objects: pictures a second of a batch, and of the cameras
+one after another.
+
+The scenes are copies of one made asset on a floor, seen at eye level: a few objects, a
+crowd, and environments with a camera each, whose instances move in every step. On the
+CPU only the first is measured.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import tyro
+
+import v3dg
+from benchmarks.evaluation import record
+from benchmarks.worlds.procedural import make_asset
+
+Row: TypeAlias = dict[str, float]
+
+
+@dataclass
+class Config:
+    device: str = "cuda"
+    gaussians: int = 125_000
+    """Gaussians of the asset."""
+    objects: int = 16
+    crowd: int = 700
+    distinct: int = 16
+    """Copies of the asset in memory; instances take them in turn."""
+    cameras: int = 256
+    sizes: tuple[int, ...] = (64, 128, 256)
+    environments: int = 1024
+    instances: int = 8
+    """Instances of each environment."""
+    repeats: int = 7
+    output: str | None = None
+
+
+def main(config: Config) -> None:
+    bundles = make_bundles(config)
+    result: dict[str, object] = {"cameras": config.cameras, "gaussians": config.gaussians}
+    result["objects"] = sizes_of(floor_of(bundles, config.objects), config)
+    if config.device == "cuda":
+        result["crowd"] = sizes_of(floor_of(bundles, config.crowd), config)
+        result["environments"] = environments_of(bundles[0], config)
+    for name, rows in result.items():
+        print(name, rows, flush=True)
+    record.write(config.output, result, config.device)
+
+
+def make_bundles(config: Config) -> list[v3dg.Bundle]:
+    asset = make_asset(config.gaussians)
+    bundle = v3dg.build_bundle(asset, progress=False, device=config.device)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "asset.v3dg"
+        bundle.write(path)
+        copies = [v3dg.Bundle.open(path) for _ in range(config.distinct)]
+        for copy in copies:
+            copy.gaussians  # noqa: B018 - which reads them
+        return copies
+
+
+def floor_of(bundles: list[v3dg.Bundle], count: int) -> v3dg.Scene:
+    """Objects on a grid three units apart."""
+    scene = v3dg.Scene()
+    side = int(np.ceil(np.sqrt(count)))
+    place = np.arange(count)
+    middle = 1.5 * (side - 1)
+    rows = [3.0 * (place % side) - middle, 3.0 * (place // side) - middle, np.zeros(count)]
+    positions = np.stack(rows, axis=1)
+    turn = np.random.default_rng(0).uniform(0, np.pi, count)
+    quaternions = np.stack([np.cos(turn), 0 * turn, 0 * turn, np.sin(turn)], axis=1)
+    in_turn = [bundles[number % len(bundles)] for number in range(count)]
+    scene.add(in_turn, positions, quaternions)
+    return scene
+
+
+def cameras_of(scene: v3dg.Scene, count: int, size: int) -> list[v3dg.Camera]:
+    """Cameras at eye level between the objects, which look along the floor."""
+    rng = np.random.default_rng(1)
+    reach = np.abs(scene.positions[:, :2]).max() + 1.5
+    cameras = []
+    for _ in range(count):
+        eye = np.append(rng.uniform(-reach, reach, 2), 0.9)
+        angle = rng.uniform(0, 2 * np.pi)
+        target = eye + np.array([np.cos(angle), np.sin(angle), -0.15])
+        cameras.append(v3dg.Camera.look_at(eye, target, fov_x=1.2, width=size, height=size))
+    return cameras
+
+
+def sizes_of(scene: v3dg.Scene, config: Config) -> list[Row]:
+    rows = [row_of(scene, size, config) for size in config.sizes]
+    for row in rows:
+        print(row, flush=True)
+    return rows
+
+
+def row_of(scene: v3dg.Scene, size: int, config: Config) -> Row:
+    cameras = cameras_of(scene, config.cameras, size)
+    renderer = v3dg.Renderer(scene, device=config.device, memory=None)
+    batch = batch_on(cameras, config.device)
+    single = batch_on(cameras[:1], config.device)
+    stats = renderer.render_batch(batch).stats
+    planes = renderer.render_batch(single).planes
+    return {
+        "size": size,
+        "gaussians": float(stats.gaussians_in_frustum.mean()),
+        "parts": stats.num_parts,
+        "batch": rate(lambda: renderer.render_batch(batch), config.cameras, config),
+        "loop": rate(
+            lambda: [renderer.render(camera) for camera in cameras], config.cameras, config
+        ),
+        "single_in_a_batch": rate(lambda: renderer.render_batch(single), 1, config),
+        "single_in_planes": rate(lambda: renderer.render_batch(single, out=planes), 1, config),
+        "single": rate(lambda: renderer.render(cameras[0]), 1, config),
+        "select_ms": stats.select_ms,
+        "draw_ms": renderer.render_batch(batch).stats.draw_ms,
+    }
+
+
+def environments_of(bundle: v3dg.Bundle, config: Config) -> Row:
+    import torch
+
+    scene = v3dg.Scene()
+    count = config.environments * config.instances
+    rng = np.random.default_rng(2)
+    start = rng.uniform(-2.5, 2.5, (count, 3)) * [1, 1, 0]
+    environment = np.repeat(np.arange(config.environments), config.instances)
+    scene.add(bundle, torch.tensor(start, device="cuda"), environment=environment)
+    camera = v3dg.Camera.look_at((0, -5, 1.0), (0, 0, 0.4), fov_x=1.0, width=128, height=128)
+    batch = v3dg.CameraBatch(
+        torch.tensor(np.stack([camera.viewmat] * config.environments), device="cuda"),
+        torch.tensor(camera.K, device="cuda"),
+        128,
+        128,
+        environments=torch.arange(config.environments, device="cuda"),
+    )
+    renderer = v3dg.Renderer(scene, device="cuda", memory=None)
+    positions = torch.tensor(start, device="cuda")
+    planes = v3dg.BatchPlanes(torch.empty(config.environments, 128, 128, 4, device="cuda"))
+
+    def step() -> None:
+        positions.add_(torch.randn_like(positions), alpha=0.001)
+        scene.move(positions=positions)
+        renderer.render_batch(batch, out=planes)
+
+    for _ in range(3):
+        step()
+    gaussians = renderer.render_batch(batch).stats.gaussians_in_frustum.mean()
+    return {"gaussians": float(gaussians), "batch": rate(step, config.environments, config)}
+
+
+def batch_on(cameras: list[v3dg.Camera], device: str) -> v3dg.CameraBatch:
+    """The cameras of one size as a batch, on the device."""
+    batch = v3dg.CameraBatch.of(cameras)
+    if device == "cpu":
+        return batch
+    import torch
+
+    viewmats = torch.tensor(batch.viewmats, device=device)
+    K = torch.tensor(batch.K, device=device)
+    return v3dg.CameraBatch(viewmats, K, batch.width, batch.height)
+
+
+def rate(draw: Callable[[], object], count: int, config: Config) -> float:
+    """Pictures a second, from an idle device to an idle device, of several calls in a
+    row; the median of repeats."""
+    calls = 1
+    if config.device == "cuda":
+        calls = 5
+    times = []
+    for _ in range(config.repeats):
+        synchronize(config.device)
+        start = time.perf_counter()
+        for _ in range(calls):
+            draw()
+        synchronize(config.device)
+        times.append((time.perf_counter() - start) / calls)
+    return round(count / statistics.median(times), 1)
+
+
+def synchronize(device: str) -> None:
+    if device == "cuda":
+        import torch
+
+        torch.cuda.synchronize()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,112 @@
+#pragma once
+
+// The cameras of a batch, and a batch of pictures that has been drawn.
+
+#include <memory>
+#include <vector>
+
+#include "bindings/array.h"
+#include "bindings/drawing.h"
+#include "frame/image.h"
+
+namespace v3dg {
+
+// A borrowed array of float32 or float64.
+struct Reals {
+    const void* data;
+    bool are_double;
+};
+
+// B cameras of one size. The arrays are on the host or on one device. They are read
+// when a batch is drawn, so they may change in place between batches.
+class BoundCameras {
+  public:
+    // viewmats: (B, 4, 4) world to camera. K: (B, 3, 3), or (3, 3) for all cameras.
+    // environments: (B,) int32 or int64, or None for cameras that see all instances.
+    // Arrays on the host are float64 and int32, and are checked.
+    BoundCameras(py::object viewmats, py::object K, int width, int height, double near,
+                 py::object environments);
+
+    Device device() const { return device_; }
+    size_t size() const { return size_; }
+    int width() const { return width_; }
+    int height() const { return height_; }
+    double near_depth() const { return near_depth_; }
+    const Reals& viewmats() const { return viewmats_; }
+    const Reals& intrinsics() const { return intrinsics_; }
+    bool shares_intrinsics() const { return shares_intrinsics_; }
+    // Environments as int32 or int64; null if the cameras see all instances.
+    const void* environments() const { return environments_; }
+    bool are_environments_long() const { return are_environments_long_; }
+
+  private:
+    py::object viewmats_object_, intrinsics_object_, environments_object_;
+    Device device_;
+    size_t size_ = 0;
+    int width_, height_;
+    double near_depth_;
+    Reals viewmats_{}, intrinsics_{};
+    bool shares_intrinsics_ = false, are_environments_long_ = false;
+    const void* environments_ = nullptr;
+};
+
+// The planes of a batch: arrays that belong to the caller, or new ones.
+class BoundPlanes {
+  public:
+    // color: (B, H, W, 3 or 4). alpha, depth: (B, H, W), or None. With four channels,
+    // alpha must be None.
+    BoundPlanes(py::object color, py::object alpha, py::object depth);
+    // Makes arrays of colour with three channels, of alpha and, if requested, of depth.
+    BoundPlanes(const BoundCameras& cameras, Device device, bool with_depth);
+
+    const py::object& color() const { return color_; }
+    const py::object& alpha() const { return alpha_; }
+    const py::object& depth() const { return depth_; }
+    const BatchPlanes& planes() const { return planes_; }
+    // Throws ValueError unless the planes fit these cameras and are on this device.
+    void check(const BoundCameras& cameras, Device device) const;
+
+  private:
+    py::object color_, alpha_, depth_;
+    Device device_;
+    py::ssize_t count_, height_, width_;
+    BatchPlanes planes_{};
+};
+
+// The statistics of each picture of a batch.
+struct BatchStats {
+    std::vector<int64_t> gaussians, in_frustum;
+    // On a device, the first element is for the whole batch.
+    std::vector<double> select_ms, draw_ms;
+    // On the host: selected gaussians of each level.
+    std::vector<std::vector<int64_t>> levels;
+    int num_parts = 1;  // number of parts in which the batch was drawn
+};
+
+// A batch that was drawn, or that was enqueued on a device.
+class BoundBatch {
+  public:
+    BoundBatch() = default;
+    virtual ~BoundBatch() = default;
+    BoundBatch(const BoundBatch&) = delete;
+    BoundBatch& operator=(const BoundBatch&) = delete;
+
+    // Waits until the pictures are drawn.
+    virtual void finish() {}
+    // Waits until the pictures are drawn, and returns their statistics.
+    virtual BatchStats stats() = 0;
+    // Keeps the inputs and the planes alive as long as this object.
+    void keep(py::object kept, const BoundPlanes& planes) {
+        kept_ = std::move(kept);
+        color = planes.color();
+        alpha = planes.alpha();
+        depth = planes.depth();
+    }
+
+    py::object color, alpha, depth;  // as in BoundPlanes
+
+  private:
+    py::object kept_;  // destroyed after the members of a derived class
+};
+
+}  // namespace v3dg
