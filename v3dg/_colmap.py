@@ -13,12 +13,13 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Literal, NamedTuple, NoReturn
+from typing import IO, Literal, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
 
 from v3dg import _files
 from v3dg._numbers import Floats, check, refuse
+from v3dg.cameras import FISHEYE_TERMS, OPENCV_TERMS, LensModel
 from v3dg.rotations import normalised, rotation_from_quaternion
 
 IMAGE_FILES = ("images.bin", "images.txt")
@@ -36,6 +37,9 @@ _WINDOWS_NOT_FINITE = re.compile(
 )
 
 
+_Term: TypeAlias = Literal["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"]
+
+
 class _Model(NamedTuple):
     """A camera model.
 
@@ -44,31 +48,34 @@ class _Model(NamedTuple):
             principal point follows.
         num_distortion: Number of distortion parameters, which are the last ones.
         projection: The projection of a lens without distortion.
+        terms: The terms of OpenCV's models that the parameters after the principal
+            point are; None for another model of distortion.
     """
 
     name: str
     num_focal: int
     num_distortion: int
     projection: Literal["pinhole", "fisheye", "sphere"]
+    terms: tuple[_Term, ...] | None = None
 
 
 _MODELS = (
-    _Model("SIMPLE_PINHOLE", 1, 0, "pinhole"),
-    _Model("PINHOLE", 2, 0, "pinhole"),
-    _Model("SIMPLE_RADIAL", 1, 1, "pinhole"),
-    _Model("RADIAL", 1, 2, "pinhole"),
-    _Model("OPENCV", 2, 4, "pinhole"),
-    _Model("OPENCV_FISHEYE", 2, 4, "fisheye"),
-    _Model("FULL_OPENCV", 2, 8, "pinhole"),
+    _Model("SIMPLE_PINHOLE", 1, 0, "pinhole", ()),
+    _Model("PINHOLE", 2, 0, "pinhole", ()),
+    _Model("SIMPLE_RADIAL", 1, 1, "pinhole", ("k1",)),
+    _Model("RADIAL", 1, 2, "pinhole", ("k1", "k2")),
+    _Model("OPENCV", 2, 4, "pinhole", ("k1", "k2", "p1", "p2")),
+    _Model("OPENCV_FISHEYE", 2, 4, "fisheye", ("k1", "k2", "k3", "k4")),
+    _Model("FULL_OPENCV", 2, 8, "pinhole", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     _Model("FOV", 2, 1, "pinhole"),
-    _Model("SIMPLE_RADIAL_FISHEYE", 1, 1, "fisheye"),
-    _Model("RADIAL_FISHEYE", 1, 2, "fisheye"),
+    _Model("SIMPLE_RADIAL_FISHEYE", 1, 1, "fisheye", ("k1",)),
+    _Model("RADIAL_FISHEYE", 1, 2, "fisheye", ("k1", "k2")),
     _Model("THIN_PRISM_FISHEYE", 2, 8, "fisheye"),
     _Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12, "fisheye"),
     _Model("SIMPLE_DIVISION", 1, 1, "pinhole"),
     _Model("DIVISION", 2, 1, "pinhole"),
-    _Model("SIMPLE_FISHEYE", 1, 0, "fisheye"),
-    _Model("FISHEYE", 2, 0, "fisheye"),
+    _Model("SIMPLE_FISHEYE", 1, 0, "fisheye", ()),
+    _Model("FISHEYE", 2, 0, "fisheye", ()),
     _Model("EUCM", 2, 2, "pinhole"),
     _Model("EQUIRECTANGULAR", 0, 0, "sphere"),
 )
@@ -96,6 +103,21 @@ class Lens:
             # If the first parameter is 0, the second one has no effect.
             return self.distortion[0] != 0
         return any(self.distortion)
+
+    @property
+    def opencv(self) -> tuple[LensModel, tuple[float, ...]] | None:
+        """The model and the distortion of a `Camera`; None if the lens has no such
+        model."""
+        names: tuple[str, ...] = self.model.terms or ()
+        terms = dict(zip(names, self.distortion, strict=False))
+        is_known = self.model.terms is not None
+        if self.model.projection == "fisheye" and is_known:
+            return "OPENCV_FISHEYE", tuple(terms.get(name, 0.0) for name in FISHEYE_TERMS)
+        if self.model.projection == "pinhole" and not self.is_distorted:
+            return "PINHOLE", ()
+        if self.model.projection == "pinhole" and is_known:
+            return "OPENCV", tuple(terms.get(name, 0.0) for name in OPENCV_TERMS)
+        return None
 
     @property
     def is_finite(self) -> bool:

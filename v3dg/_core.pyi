@@ -29,16 +29,28 @@ def isa() -> str: ...
 def num_cuda_devices() -> int: ...
 
 class Camera:
-    """A pinhole camera, or a window of its image."""
+    """A camera of any model, or a window of its image."""
 
     def __init__(
-        self, *, viewmat: Float64, K: Float64, width: int, height: int, near: float
+        self,
+        *,
+        viewmat: Float64,
+        K: Float64,
+        width: int,
+        height: int,
+        near: float,
+        model: Literal["pinhole", "opencv", "fisheye"] = "pinhole",
+        distortion: Sequence[float] = ...,
     ) -> None: ...
     def window(self, x0: int, y0: int, x1: int, y1: int) -> Camera: ...
     @property
     def position(self) -> Float64: ...
     @property
     def K(self) -> Float64: ...
+    @property
+    def lens_range(self) -> float: ...
+    @property
+    def px2_per_steradian(self) -> float: ...
     @property
     def width(self) -> int: ...
     @property

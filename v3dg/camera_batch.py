@@ -12,7 +12,7 @@ import numpy.typing as npt
 from v3dg import _core
 from v3dg._device import CPU, Device, of
 from v3dg._numbers import MOST_INT, check, check_type, floats, positive, whole
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, check_pinhole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -138,6 +138,7 @@ class CameraBatch:
         check("cameras", cameras, "at least one, got none")
         for number, camera in enumerate(cameras):
             check_type(f"cameras[{number}]", camera, Camera, "a Camera")
+            check_pinhole(f"cameras[{number}]", camera, "draw such cameras one by one")
             is_alike = form_of(camera) == form_of(cameras[0])
             check(f"cameras[{number}]", is_alike, "the size and the near plane of the first one")
         first = cameras[0]

@@ -7,7 +7,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -15,12 +15,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from v3dg import _files
-from v3dg._colmap import IMAGE_FILES, LENS_FILES, read_model
+from v3dg._colmap import IMAGE_FILES, LENS_FILES, Image, read_model
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check, one_of, refuse
 from v3dg.cameras import (
+    FISHEYE_TERMS,
+    OPENCV_TERMS,
     Camera,
     Floats,
+    LensModel,
     check_cameras,
     intrinsics,
     is_rotation,
@@ -28,14 +31,12 @@ from v3dg.cameras import (
     viewmat_from_blender,
 )
 
-# COLMAP's camera models that are pinholes if their distortion is zero, which is checked
-# separately.
+# COLMAP's names of cameras that OpenCV's models describe.
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_UNDISTORT = (
-    "undistort the pictures first, or ignore the distortion: distortion='ignore' in Python, "
-    "--distortion ignore in a command"
-)
+_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+# The coefficients of a pinhole in a file of nerfstudio, unless it is a FULL_OPENCV. Its
+# k4 is not that of OpenCV, but the factor of r⁸.
+_PINHOLE_TERMS = ("k1", "k2", "p1", "p2", "k3")
 _MOST_NAMED = 8  # number of images that a warning lists
 _RUN = "config.yml"  # a folder with this file is a run of nerfstudio
 # Transform from the data of a run to its training.
@@ -57,7 +58,7 @@ def read_cameras(
     path: str | os.PathLike[str],
     *,
     size: tuple[int, int] | None = None,
-    distortion: Literal["refuse", "ignore"] = "refuse",
+    distortion: Literal["draw", "ignore"] = "draw",
     applied_transform: Literal["keep", "undo"] = "keep",
 ) -> dict[str, Camera]:
     """Read the cameras of a nerfstudio `transforms.json`, in file order
@@ -83,18 +84,19 @@ def read_cameras(
     Args:
         size: Width and height in px for a file that has neither `w` and `h` nor focal
             lengths in px.
-        distortion: "refuse" raises an error for a lens with distortion; "ignore"
-            returns a pinhole camera without the distortion.
+        distortion: "draw" returns cameras with the lens distortion of the file;
+            "ignore" returns pinhole cameras without it, and raises an error for a
+            fisheye.
         applied_transform: "keep" leaves cameras in the frame of the file. "undo"
             inverts the file's `applied_transform` and `applied_scale`, for assets in
             the original frame of the data.
 
     Raises:
-        ValueError: The content is invalid or has cameras that are not pinholes; the
-            message names the place in the file.
+        ValueError: The content is invalid or has cameras of another model than those of
+            `Camera`; the message names the place in the file.
         OSError: The file cannot be read.
     """
-    one_of(distortion, "distortion", ("refuse", "ignore"))
+    one_of(distortion, "distortion", ("draw", "ignore"))
     one_of(applied_transform, "applied_transform", ("keep", "undo"))
     place = _place_of(Path(path))
     if place.file.name in IMAGE_FILES:
@@ -259,7 +261,7 @@ def _read_frame(
     """Return the camera of a frame. Fields that the frame lacks are taken from the top
     of the file."""
     fields = {**top, **frame}
-    _check_is_pinhole(fields, distortion)
+    lens_model, coefficients = _lens(fields, distortion)
     focal = top
     if "fl_x" in frame or "camera_angle_x" in frame:
         focal = frame
@@ -274,7 +276,7 @@ def _read_frame(
         with np.errstate(over="ignore", invalid="ignore"):
             viewmat = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
             viewmat[:3] /= scale  # the camera's rotation must have scale 1
-    return node.attempt(partial(Camera, viewmat, K, width, height, near))
+    return node.attempt(partial(Camera, viewmat, K, width, height, near, coefficients, lens_model))
 
 
 def _data_of(run: Path) -> Path:
@@ -327,18 +329,32 @@ def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
         warnings.warn(f"{images}: {text}", CameraWarning, stacklevel=3)
     named = []
     for image in finite:
-        lens = image.lens
-        place = f"{images}: {image.name}"
-        is_plain = distortion == "ignore" or not lens.is_distorted
-        is_right = lens.model.projection == "pinhole" and is_plain
-        expected = "a pinhole without lens distortion"
-        check(place, is_right, f"{expected}, got {lens.model.name}; {_UNDISTORT}")
-        K = np.diag([lens.focal_lengths[0], lens.focal_lengths[-1], 1.0])
-        K[:2, 2] = lens.center
-        with _files.value_errors(place, "a camera"):
-            camera = Camera(image.viewmat, K, lens.width, lens.height)
-        named.append((image.name, camera))
+        named.append((image.name, _camera_of(image, f"{images}: {image.name}", distortion)))
     return _named(named)
+
+
+def _camera_of(image: Image, place: str, distortion: str) -> Camera:
+    """Return the camera of an image of a COLMAP model."""
+    lens = image.lens
+    model: LensModel = "PINHOLE"
+    coefficients: tuple[float, ...] = ()
+    if distortion == "ignore":
+        is_pinhole = lens.model.projection == "pinhole"
+        expected = "a pinhole apart from lens distortion"
+        check(place, is_pinhole, f"{expected}, got {lens.model.name}; draw its distortion")
+    elif lens.opencv is None:
+        refuse(
+            place,
+            f"a lens of one of OpenCV's models, got {lens.model.name}; undistort the pictures",
+        )
+    else:
+        model, coefficients = lens.opencv
+    K = np.diag([lens.focal_lengths[0], lens.focal_lengths[-1], 1.0])
+    K[:2, 2] = lens.center
+    with _files.value_errors(place, "a camera"):
+        return Camera(
+            image.viewmat, K, lens.width, lens.height, distortion=coefficients, model=model
+        )
 
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:
@@ -360,25 +376,71 @@ def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -
             "cy": camera.cy,
             "near": camera.near,
             "transform_matrix": to_world.tolist(),
+            **_lens_as_json(camera),
         }
         frames.append(frame)
     write_json(path, {"camera_model": "PINHOLE", "frames": frames})
 
 
-def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
+def _lens_as_json(camera: Camera) -> dict[str, object]:
+    """Return the fields of nerfstudio for the lens of a camera."""
+    if not camera.is_distorted:
+        return {}
+    if camera.model == "OPENCV_FISHEYE":
+        return {"camera_model": camera.model, **_by_term(FISHEYE_TERMS, camera.distortion)}
+    coefficients = _by_term(OPENCV_TERMS, camera.distortion)
+    if any(coefficients[term] for term in ("k4", "k5", "k6")):
+        return {"camera_model": "FULL_OPENCV", **coefficients}
+    return {"camera_model": "OPENCV", **{term: coefficients[term] for term in _PINHOLE_TERMS}}
+
+
+def _by_term(terms: Sequence[str], coefficients: Sequence[float]) -> dict[str, float]:
+    """Return coefficients by their names; those that are left out are 0."""
+    return {**dict.fromkeys(terms, 0.0), **dict(zip(terms, coefficients, strict=False))}
+
+
+def _lens(fields: Mapping[str, Node], distortion: str) -> tuple[LensModel, tuple[float, ...]]:
+    """Return the camera model and the distortion in a file of nerfstudio."""
+    if _is_fisheye(fields, distortion):
+        return "OPENCV_FISHEYE", tuple(_term(fields, name) for name in FISHEYE_TERMS)
     model = fields.get("camera_model")
-    if model is not None and model.value not in _PINHOLES:
-        raise model.error(
-            f"a pinhole camera ({', '.join(_PINHOLES)})", "undistort the pictures first"
-        )
-    fisheye = fields.get("is_fisheye")
-    if fisheye is not None and fisheye.value not in (False, 0):
-        raise fisheye.error("a pinhole camera", "undistort the pictures first")
+    terms: tuple[str, ...] = _PINHOLE_TERMS
+    if model is not None and model.value == "FULL_OPENCV":
+        terms = OPENCV_TERMS
+    coefficients = tuple(_term(fields, name) for name in terms)
     if distortion == "ignore":
-        return
-    for name in _DISTORTION:
-        if name in fields and fields[name].number() != 0:
-            raise fields[name].error("no lens distortion", _UNDISTORT)
+        return "PINHOLE", ()
+    for name in ("k4", "k5", "k6"):
+        if name not in terms and _term(fields, name) != 0:
+            raise fields[name].error(
+                "0 unless the camera is a fisheye or a FULL_OPENCV",
+                "ignore the distortion: distortion='ignore'",
+            )
+    if any(coefficients):
+        return "OPENCV", coefficients
+    return "PINHOLE", ()
+
+
+def _is_fisheye(fields: Mapping[str, Node], distortion: str) -> bool:
+    model = fields.get("camera_model")
+    if model is not None and model.value not in (*_PINHOLES, *_FISHEYES):
+        names = ", ".join((*_PINHOLES, *_FISHEYES))
+        raise model.error(f"a camera model of OpenCV ({names})", "undistort the pictures first")
+    signs = []
+    if model is not None and model.value in _FISHEYES:
+        signs.append(model)
+    flag = fields.get("is_fisheye")
+    if flag is not None and flag.value not in (False, 0):
+        signs.append(flag)
+    if signs and distortion == "ignore":
+        raise signs[0].error("a pinhole camera", "draw the distortion of a fisheye")
+    return bool(signs)
+
+
+def _term(fields: Mapping[str, Node], name: str) -> float:
+    if name not in fields:
+        return 0.0
+    return fields[name].number()
 
 
 def _rows(node: Node) -> Floats:

@@ -1,10 +1,10 @@
-"""Pinhole cameras: made from matrices, from two points, or from Blender's convention,
-and series of cameras on a turntable."""
+"""Cameras, pinholes or with lens distortion: made from matrices, from two points, or
+from Blender's convention, and series of cameras on a turntable."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal, TypeAlias, TypeVar, cast, get_args
 
 import numpy as np
@@ -12,13 +12,25 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._numbers import Floats as Floats
-from v3dg._numbers import check, check_type, positive, real, refuse, vector, whole
+from v3dg._numbers import check, check_type, one_of, positive, real, refuse, vector, whole
 
 T = TypeVar("T")
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[np.generic]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[np.generic]
 Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = get_args(Axis)
+# Named as in COLMAP and nerfstudio.
+LensModel: TypeAlias = Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE"]
+LENS_MODELS: tuple[LensModel, ...] = get_args(LensModel)
+# The coefficients of a distortion, in order.
+OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
+# Numbers of coefficients that each model may have.
+_NUM_COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
+    "PINHOLE": (0,),
+    "OPENCV": (4, 5, 8),
+    "OPENCV_FISHEYE": (4,),
+}
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
 # The near plane as a fraction of the distance to the subject, and its bounds in world
@@ -34,10 +46,13 @@ ROTATION_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera in the OpenCV convention: x right, y down, z forward.
+    """Camera in the OpenCV convention: x right, y down, z forward.
 
     Pixel (i, j) has its centre at (i + ½, j + ½). Matrices are copied and converted to
     double precision.
+
+    The models are those of OpenCV's documentation of camera calibration. Points beyond
+    the first fold of a lens, where its image would turn back, are not drawn.
 
     Args:
         viewmat: (4, 4) world to camera, a rotation and a translation.
@@ -46,6 +61,12 @@ class Camera:
         height: Image height in px.
         near: Gaussians whose mean has a smaller depth than this are not drawn; world
             units, > 0.
+        distortion: Coefficients of the model in OpenCV's order: for "OPENCV" k1, k2,
+            p1, p2, or these and k3, or these and k3 to k6; for "OPENCV_FISHEYE" k1 to
+            k4; none for "PINHOLE".
+        model: "PINHOLE"; "OPENCV" with radial and tangential distortion; or
+            "OPENCV_FISHEYE", whose field of view may exceed 180 degrees. The depth of a
+            fisheye is the distance from the eye, of others that along the axis.
 
     Raises:
         ValueError: A shape or a value is invalid.
@@ -56,6 +77,8 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
+    distortion: Sequence[float] = ()
+    model: LensModel = "PINHOLE"
     # Focal lengths and principal point in px, from K.
     fx: float = field(init=False)
     fy: float = field(init=False)
@@ -85,6 +108,7 @@ class Camera:
             width=_side(self.width, "width"),
             height=_side(self.height, "height"),
             near=positive(self.near, "near"),
+            distortion=_coefficients(self.distortion, self.model),
             fx=fx,
             fy=fy,
             cx=cx,
@@ -177,12 +201,52 @@ class Camera:
     @cached_property
     def core(self) -> _core.Camera:
         """The camera for the compiled operations."""
-        return _core.Camera(
-            viewmat=self.viewmat, K=self.K, width=self.width, height=self.height, near=self.near
+        make = partial(
+            _core.Camera,
+            viewmat=self.viewmat,
+            K=self.K,
+            width=self.width,
+            height=self.height,
+            near=self.near,
         )
+        if self.model == "OPENCV_FISHEYE":
+            return make(model="fisheye", distortion=list(self.distortion))
+        if self.is_distorted:
+            k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, 0.0, 0.0, 0.0, 0.0)[:8]
+            return make(model="opencv", distortion=[k1, k2, k3, k4, k5, k6, p1, p2])
+        return make()
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the camera is drawn as another model than a pinhole."""
+        return self.model == "OPENCV_FISHEYE" or any(self.distortion)
+
+    @property
+    def pinhole(self) -> "Camera":
+        """The same camera without its lens distortion."""
+        return replace(self, distortion=(), model="PINHOLE")
+
+    def directions(self, positions: MatrixLike) -> Floats:
+        """Return the points at depth 1 that are seen at positions in the image.
+
+        Args:
+            positions: (N, 2) u and v in px.
+
+        Returns:
+            (N, 3) in camera coordinates. The multiple by a depth is the point at that
+            depth. NaN where the lens shows nothing.
+        """
+        pixels = np.asarray(positions, np.float64).reshape(-1, 2)
+        image = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not self.is_distorted:
+            return np.column_stack([image, np.ones(len(image))])
+        if self.model == "OPENCV_FISHEYE":
+            return _fisheye_directions(image, self.distortion, self.core.lens_range)
+        return _opencv_directions(image, self.distortion, self.core.lens_range)
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return Camera, (self.viewmat, self.K, self.width, self.height, self.near)
+        values = (self.viewmat, self.K, self.width, self.height, self.near)
+        return Camera, (*values, self.distortion, self.model)
 
     def scaled(self, factor: int) -> "Camera":
         """Return this camera with ``factor`` times the resolution, for
@@ -193,6 +257,8 @@ class Camera:
 
     def __repr__(self) -> str:
         lens = f"fx={self.fx:g}, fy={self.fy:g}"
+        if self.is_distorted:
+            lens += f", {self.model} {_text(self.distortion)}"
         return f"Camera({self.width}x{self.height}, eye={_text(self.position)}, {lens})"
 
 
@@ -202,7 +268,7 @@ class StereoCamera:
     cut.
 
     Raises:
-        ValueError: The cameras have different rotations.
+        ValueError: The cameras have different rotations, or lens distortion.
     """
 
     left: Camera
@@ -215,6 +281,8 @@ class StereoCamera:
             "different rotations one by one"
         )
         check("right", has_same_rotation, expected)
+        for name, camera in (("left", self.left), ("right", self.right)):
+            check_pinhole(name, camera, "draw such cameras one by one")
 
     @classmethod
     def of(cls, camera: Camera, eye_distance: float) -> "StereoCamera":
@@ -254,6 +322,11 @@ def for_each(
     if hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0:
         return [make(view) for view in cast(Iterable[Camera], camera)]
     return make(cast(Camera, camera))
+
+
+def check_pinhole(name: str, camera: Camera, advice: str) -> None:
+    """Raise ValueError unless a camera has no lens distortion."""
+    check(name, not camera.is_distorted, f"a pinhole, got {camera.model} with distortion; {advice}")
 
 
 def check_cameras(cameras: object) -> None:
@@ -397,5 +470,71 @@ def _side(value: int, name: str) -> int:
     return whole(value, name, "a positive whole number", 1)
 
 
-def _text(vector: Floats) -> str:
+def _coefficients(distortion: Sequence[float], model: LensModel) -> tuple[float, ...]:
+    """Return the coefficients of a lens; ValueError for a wrong number of them."""
+    one_of(model, "model", LENS_MODELS)
+    expected = _NUM_COEFFICIENTS[model]
+    values = tuple(real(value, "distortion") for value in distortion)
+    numbers = " or ".join(map(str, expected))
+    check(
+        "distortion",
+        len(values) in expected,
+        f"{numbers} coefficients of {model}, got {len(values)}",
+    )
+    return values
+
+
+def _first_reaching(radius: Floats, end: float, function: Callable[[Floats], Floats]) -> Floats:
+    """Return where an increasing function has a value, by bisection from 0 to ``end``;
+    NaN where it is smaller everywhere."""
+    low = np.zeros_like(radius)
+    high = np.full_like(radius, end)
+    is_reached = function(high) >= radius
+    for _ in range(60):
+        middle = (low + high) / 2
+        is_above = function(middle) >= radius
+        high = np.where(is_above, middle, high)
+        low = np.where(is_above, low, middle)
+    return np.where(is_reached, high, math.nan)
+
+
+def _fisheye_directions(image: Floats, coefficients: Sequence[float], end: float) -> Floats:
+    """Return unit vectors; ``image`` is in units of the focal lengths."""
+
+    def image_radius(angle: Floats) -> Floats:
+        square = angle**2
+        return angle * np.polyval([*reversed(coefficients), 1.0], square)
+
+    radius = np.hypot(image[:, 0], image[:, 1])
+    angle = _first_reaching(radius, end, image_radius)
+    across = np.sin(angle) / np.where(radius > 0, radius, 1)
+    return np.column_stack([image * across[:, None], np.cos(angle)])
+
+
+def _opencv_directions(image: Floats, coefficients: Sequence[float], end: float) -> Floats:
+    """Return (x / z, y / z, 1); ``image`` is in units of the focal lengths. The radial
+    distortion is inverted by bisection, and the tangential one by iteration."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+
+    def radial_factor(square: Floats) -> Floats:
+        numerator = np.polyval([k3, k2, k1, 1.0], square)
+        return numerator / np.polyval([k6, k5, k4, 1.0], square)
+
+    slopes = np.zeros_like(image)
+    for _ in range(40):
+        x, y = slopes.T
+        square = x**2 + y**2
+        shift_x = 2 * p1 * x * y + p2 * (square + 2 * x**2)
+        shift_y = p1 * (square + 2 * y**2) + 2 * p2 * x * y
+        radial = image - np.column_stack([shift_x, shift_y])
+        radius = np.hypot(radial[:, 0], radial[:, 1])
+        slope = _first_reaching(radius, end, lambda r: r * radial_factor(r**2))
+        slopes = radial * (slope / np.where(radius > 0, radius, 1))[:, None]
+        if not (p1 or p2):
+            break
+    depth = np.where(np.isnan(slopes[:, 0]), math.nan, 1.0)
+    return np.column_stack([slopes, depth])
+
+
+def _text(vector: Sequence[float] | Floats) -> str:
     return "(" + ", ".join(f"{v:g}" for v in vector) + ")"

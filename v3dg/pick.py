@@ -53,7 +53,8 @@ def pick(
     renderer: Renderer | None = None,
 ) -> Pick | None:
     """Return the gaussian with the largest weight in pixel (x, y) of the picture that
-    `v3dg.render` draws; None if the pixel is empty.
+    `v3dg.render` draws; None if the pixel is empty. Its position is NaN where the lens
+    shows no direction, and a gaussian beside it reaches the pixel.
 
     Only this pixel is computed, on the CPU. The cut is the same on every device.
 
@@ -91,7 +92,7 @@ def pick(
         return None
     bundle = scene.bundles[scene.instance_bundle[hit.instance]]
     level = int(bundle.clusters.level[hit.cluster])
-    ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
+    ray = camera.directions([[x + 0.5, y + 0.5]])[0]
     position = camera.position + hit.depth * ray @ camera.viewmat[:3, :3]
     return Pick(hit.instance, hit.cluster, level, hit.weight, hit.depth, position)
 

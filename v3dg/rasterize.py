@@ -45,7 +45,7 @@ def rasterize(
 
     Args:
         gaussians: N gaussians in world space, or the path of an asset's file.
-        camera: Pinhole camera.
+        camera: Camera of any model.
         filter_px2: Variance of the low-pass filter in screen space, px². The original
             code of 3DGS trains with 0.3.
         antialiased: Whether to multiply opacities by the square root of det(covariance)

@@ -10,10 +10,15 @@ from v3dg._device import Device
 from v3dg._numbers import check_type, one_of, real, refuse, whole
 from v3dg._progress import Progress
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, check_pinhole
 from v3dg.levels.refined import DROP, refined_bundle
 from v3dg.levels.viewpoints import SeenFrom
 from v3dg.opening import File
+
+_UNDISTORT = (
+    "undistort the pictures first, or ignore the distortion: distortion='ignore' in Python, "
+    "--distortion ignore in a command"
+)
 
 
 def refine_bundle(
@@ -76,6 +81,7 @@ def refine_bundle(
     cameras = list(cameras)
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
+        check_pinhole(f"cameras[{number}]", camera, _UNDISTORT)
     one_of(seen_from, "seen_from", get_args(SeenFrom))
     if seen_from != "auto" and cameras:
         refuse("seen_from", f"auto with cameras, got {seen_from}")

@@ -267,9 +267,9 @@ def select(
     Args:
         subject: A scene or a bundle; or the path of its file, which is opened in every
             call.
-        camera: Pinhole camera. For a stereo camera, the cut is detailed enough for the
-            nearer eye and includes everything that either eye may see. A stereo camera
-            cannot be combined with the paper's footprint.
+        camera: Camera of any model. For a stereo camera, the cut is detailed enough for
+            the nearer eye and includes everything that either eye may see. Stereo and
+            distorted cameras cannot be combined with the paper's footprint.
         tolerance: Largest screen area, in px² per gaussian, at which a coarser cluster
             replaces finer ones. 0 chooses full detail wherever it covers any area;
             infinity chooses the coarsest clusters. None means `DEFAULT_TOLERANCE`, or 0

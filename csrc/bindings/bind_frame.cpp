@@ -82,6 +82,7 @@ struct BoundRequest {
                 .rule = rule == nullptr ? SelectRule{} : *rule,
                 .shade = shade == nullptr ? Shade{} : *shade},
           cluster_colors(look == nullptr ? py::object() : py::object(look->cluster_colors)) {
+        check_footprint(plain.eyes, plain.rule);
         if (given != nullptr && plain.eyes.are_two)
             throw py::value_error(
                 "cut: expected one camera, got two eyes; draw each eye separately");

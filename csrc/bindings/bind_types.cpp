@@ -26,14 +26,38 @@ void set_window(const Corners& w, Camera& camera) {
     camera.y1 = w[3];
 }
 
+template <size_t kCount>
+std::array<double, kCount> coefficients(const std::vector<double>& distortion) {
+    if (distortion.size() != kCount)
+        throw py::value_error("distortion: expected " + std::to_string(kCount) +
+                              " coefficients, got " + std::to_string(distortion.size()));
+    std::array<double, kCount> values;
+    std::copy(distortion.begin(), distortion.end(), values.begin());
+    return values;
+}
+
+Intrinsics<double> with_lens(const Pinhole<double>& projection, const std::string& model,
+                             const std::vector<double>& distortion) {
+    if (model == "opencv")
+        return intrinsics_of_opencv(projection, coefficients<8>(distortion).data());
+    if (model == "fisheye")
+        return intrinsics_of_fisheye(projection, coefficients<4>(distortion).data());
+    if (model != "pinhole")
+        throw py::value_error("model: expected pinhole, opencv or fisheye, got " + model);
+    coefficients<0>(distortion);
+    return intrinsics_of(projection);
+}
+
 BoundCamera make_camera(const py::array& viewmat, const py::array& K, int width, int height,
-                        double near) {
+                        double near, const std::string& model,
+                        const std::vector<double>& distortion) {
     check_image_size(width, height);
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
     const Span<const double> k = span_of<const double>(K, "K", {3, 3});
     BoundCamera out;
     std::copy(view.begin(), view.end(), out.viewmat.begin());
     out.camera = camera_of(view.data, k.data, width, height, near);
+    out.camera.set_lens(with_lens(out.camera.pinhole(), model, distortion));
     return out;
 }
 
@@ -47,16 +71,27 @@ py::array_t<double> position_of(const BoundCamera& camera) {
     return py::array_t<double>(3, camera.camera.eye);
 }
 
-py::array_t<double> intrinsics_of(const BoundCamera& bound) {
+py::array_t<double> matrix_of(const BoundCamera& bound) {
     const Camera& camera = bound.camera;
     const double K[9] = {camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1};
     return py::array_t<double>({3, 3}, K);
+}
+
+double lens_range_of(const BoundCamera& bound) {
+    const Camera& camera = bound.camera;
+    switch (camera.model()) {
+        case LensModel::opencv: return camera.opencv().valid_slope;
+        case LensModel::fisheye: return camera.fisheye().valid_angle;
+        default: return INFINITY;
+    }
 }
 
 BoundEyes make_eyes(const BoundCamera& left, const BoundCamera& right) {
     if (!std::equal(left.camera.rotation, left.camera.rotation + 9, right.camera.rotation))
         throw py::value_error(
             "left, right: expected cameras with the same rotation, got different rotations");
+    if (!left.camera.is_pinhole() || !right.camera.is_pinhole())
+        throw py::value_error("left, right: expected pinholes, got a distorted camera");
     return {Eyes(left.camera, right.camera)};
 }
 
@@ -84,6 +119,15 @@ SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32
 }
 
 }  // namespace
+
+void check_footprint(const Eyes& eyes, const SelectRule& rule) {
+    if (rule.footprint != Footprint::paper) return;
+    if (eyes.are_two)
+        throw py::value_error("footprint: expected 'solid_angle' for two eyes, got 'paper'");
+    if (!eyes.camera[0].is_pinhole())
+        throw py::value_error(
+            "footprint: expected 'solid_angle' for a distorted camera, got 'paper'");
+}
 
 void check_image_size(int width, int height) {
     if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
@@ -205,13 +249,22 @@ py::object sh_bases_of(int degree, const py::array& directions) {
 void bind_types(py::module_& m) {
     m.def("sh_bases", &sh_bases_of, "degree"_a, "directions"_a,
           "Returns the bases of spherical harmonics in unit directions: (D, (degree + 1)^2).");
-    py::class_<BoundCamera>(m, "Camera", "A pinhole camera, or a window of its image.")
+    py::class_<BoundCamera>(m, "Camera", "A camera of any model, or a window of its image.")
         .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a,
-             "near"_a)
+             "near"_a, "model"_a = "pinhole", "distortion"_a = std::vector<double>{},
+             "The model is pinhole; opencv, with the coefficients k1 to k6, p1 and p2; or fisheye, "
+             "with k1 to k4.")
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
              "Returns the camera for a part of its image: x in [x0, x1) and y in [y0, y1), px.")
         .def_property_readonly("position", &position_of, "The position in the world: (3,).")
-        .def_property_readonly("K", &intrinsics_of, "The camera matrix, px: (3, 3).")
+        .def_property_readonly("K", &matrix_of, "The camera matrix, px: (3, 3).")
+        .def_property_readonly("lens_range", &lens_range_of,
+                               "The end of the valid range of a lens: the largest slope x / z of "
+                               "opencv, the largest angle of fisheye in radians.")
+        .def_property_readonly(
+            "px2_per_steradian",
+            [](const BoundCamera& bound) { return bound.camera.px2_per_steradian(); },
+            "The density of pixels that selection assumes.")
         .def_property_readonly("width", &BoundCamera::width)
         .def_property_readonly("height", &BoundCamera::height);
     py::class_<BoundEyes>(m, "Eyes",

@@ -116,8 +116,7 @@ void BoundScene::set_poses(const py::object& positions, const py::object& quater
 }
 
 BoundCut BoundScene::select(const BoundEyes& camera, const SelectRule& rule, BudgetSteps* steps) {
-    if (camera.eyes.are_two && rule.footprint == Footprint::paper)
-        throw py::value_error("footprint: expected 'solid_angle' for two eyes, got 'paper'");
+    check_footprint(camera.eyes, rule);
     const std::shared_ptr<const SceneState> state = state_;
     const Work work(device_);
     const auto cut = [&](const SelectRule& paced, uint32_t* last_bin) {

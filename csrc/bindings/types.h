@@ -27,6 +27,10 @@ struct BoundEyes {
     Eyes eyes;
 };
 
+// Throws ValueError unless the rule's footprint is defined for the cameras: the paper's
+// is defined for one pinhole only.
+void check_footprint(const Eyes& eyes, const SelectRule& rule);
+
 // The arrays of gaussians: all on the host or all on one CUDA device; float32 or, on
 // the host, float64.
 class Rows {

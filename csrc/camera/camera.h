@@ -11,10 +11,10 @@
 //    the list says V, a member also takes vectors.
 // 2. Check the model with a static_assert, as for Pinhole below.
 //    tests/cpp/second_camera.cpp shows a small second model that projects gaussians.
-// 3. Add the model to Intrinsics<T>, the only place that chooses a model. Intrinsics<T>
-//    is an alias while there is one model. With several models, make it a struct that
-//    holds a tag and one of the models, and whose members call the members of that
-//    model. Such a struct satisfies CameraModel itself, so kernels do not change.
+// 3. Add the model to LensModel and to Intrinsics<T>, the only place that chooses a
+//    model. Code that projects many gaussians chooses once, by visit() on the host and
+//    by a template argument of a kernel, so that pinholes do not pay for other models.
+//    Distorted models share camera/distorted.h.
 // 4. Let users create the model: extend bindings/bind_types.cpp, v3dg/cameras.py and,
 //    if camera files can name the model, v3dg/camera_file.py. The code in fit_group/
 //    and levels/ draws its own pictures with pinholes and needs no change.
@@ -41,7 +41,8 @@
 //
 // Projection
 // - depth_of(p): the depth of a point in view space. Gaussians are sorted by depth. A
-//   point is drawn if its depth is at least near_depth.
+//   point is drawn if its depth is at least near_depth. It is negative for points that
+//   the model does not show.
 // - limits(): computes the Limits of an image.
 // - linearized(limits, p): the Jacobian of the projection at p.
 // - to_pixel(at, p, u, v): the pixel (u, v) of p.
@@ -73,29 +74,191 @@
 //   frame of an instance. `first` and `second` are the axes of the two eyes, which are
 //   equal if there is one eye. A gaussian outside of any plane is not drawn.
 //   Plane::guard accounts for the linearisation; with INFINITY, a plane culls nothing.
+// - set_guard_direction(axes, direction): the direction of Plane::guard in the frame of
+//   an instance.
 
 #include <concepts>
+#include <cstdint>
 #include <cstring>
 #include <type_traits>
 
+#include "camera/fisheye.h"
 #include "camera/image_terms.h"
+#include "camera/opencv.h"
 #include "camera/pinhole.h"
 #include "math/similarity.h"
 #include "math/view.h"
 
 namespace v3dg {
 
-// The camera model in use.
+// The models that a camera may have.
+enum class LensModel { pinhole, opencv, fisheye };
+
+// A camera of any model: the fields of a pinhole, and the parameters of its lens, which
+// only the model reads. Its members call those of the model. Loops over gaussians use
+// visit() outside of the loop, so that pinholes do not pay for the choice.
 template <class T>
-using Intrinsics = Pinhole<T>;
+struct Intrinsics : Pinhole<T> {
+    using Limits = SlopeLimits<T>;
+    template <class V>
+    using Point = ImagePoint<V>;
+    static constexpr int kNumLensValues = 10;
+
+    // LensModel, in a type as large as T, so that there is no padding.
+    std::conditional_t<sizeof(T) == sizeof(int64_t), int64_t, int32_t> lens;
+    T lens_values[kNumLensValues];
+
+    V3DG_HD V3DG_INLINE LensModel model() const { return static_cast<LensModel>(lens); }
+    V3DG_HD V3DG_INLINE bool is_pinhole() const { return model() == LensModel::pinhole; }
+    V3DG_HD V3DG_INLINE const Pinhole<T>& pinhole() const { return *this; }
+    V3DG_HD V3DG_INLINE OpenCv<T> opencv() const {
+        const T* v = lens_values;
+        return {{pinhole()}, {v[0], v[1], v[2], v[3], v[4], v[5]}, v[6], v[7], v[8], v[9]};
+    }
+    V3DG_HD V3DG_INLINE Fisheye<T> fisheye() const {
+        const T* v = lens_values;
+        return {{pinhole()}, {v[0], v[1], v[2], v[3]}, v[4], v[5], v[6], v[7], v[8]};
+    }
+    // Returns body(model).
+    template <class Body>
+    V3DG_HD V3DG_INLINE auto visit(const Body& body) const {
+        switch (model()) {
+            case LensModel::opencv: return body(opencv());
+            case LensModel::fisheye: return body(fisheye());
+            default: return body(pinhole());
+        }
+    }
+
+    template <class U>
+    V3DG_HD Intrinsics<U> rounded_to() const {
+        Intrinsics<U> out{pinhole().template rounded_to<U>(), {}, {}};
+        out.lens = static_cast<decltype(out.lens)>(lens);
+        for (int i = 0; i < kNumLensValues; ++i) out.lens_values[i] = U(lens_values[i]);
+        return out;
+    }
+    template <class V>
+    V3DG_HD V3DG_INLINE V depth_of(const V p[3]) const {
+        switch (model()) {
+            case LensModel::opencv: return opencv().depth_of(p);
+            case LensModel::fisheye: return fisheye().depth_of(p);
+            default: return pinhole().depth_of(p);
+        }
+    }
+    V3DG_HD V3DG_INLINE SlopeLimits<T> limits() const { return pinhole().limits(); }
+    template <class V>
+    V3DG_HD V3DG_INLINE ImagePoint<V> linearized(const SlopeLimits<T>& limits, const V p[3]) const {
+        switch (model()) {
+            case LensModel::opencv: return opencv().linearized(limits, p);
+            case LensModel::fisheye: return fisheye().linearized(limits, p);
+            default: break;
+        }
+        const PinholePoint<V> at = pinhole().linearized(limits, p);
+        const V fx_z = this->fx * at.inv_z, fy_z = this->fy * at.inv_z;
+        ImagePoint<V> out{{}, {}, {fx_z, {}, -fx_z * at.slope_x}, {{}, fy_z, -fy_z * at.slope_y}};
+        pinhole().to_pixel(at, p, out.u, out.v);
+        return out;
+    }
+    template <class V>
+    V3DG_HD V3DG_INLINE void to_pixel(const ImagePoint<V>& at, const V*, V& u, V& v) const {
+        u = at.u;
+        v = at.v;
+    }
+    template <class V, class W>
+    V3DG_HD V3DG_INLINE void times_jacobian(const ImagePoint<V>& at, const W& x, const W& y,
+                                            const W& z, V& a1, V& a2) const {
+        a1 = at.j1[0] * x + at.j1[1] * y + at.j1[2] * z;
+        a2 = at.j2[0] * x + at.j2[1] * y + at.j2[2] * z;
+    }
+    template <class V>
+    V3DG_HD V3DG_INLINE void linearized_vjp(const ImagePoint<V>& at, const V p[3], const V m[9],
+                                            const V a1[3], const V a2[3], const LinearImage<V>& d,
+                                            V d_p[3], V d_m[9]) const {
+        switch (model()) {
+            case LensModel::opencv: return opencv().linearized_vjp(at, p, m, a1, a2, d, d_p, d_m);
+            case LensModel::fisheye: return fisheye().linearized_vjp(at, p, m, a1, a2, d, d_p, d_m);
+            default: break;
+        }
+        pinhole().linearized_vjp(pinhole().linearized(limits(), p), p, m, a1, a2, d, d_p, d_m);
+    }
+    V3DG_HD V3DG_INLINE T sphere_scale(const SlopeLimits<T>& limits, T squared_model_scale) const {
+        return is_pinhole() ? pinhole().sphere_scale(limits, squared_model_scale) : T(NAN);
+    }
+    V3DG_HD T px2_per_steradian() const {
+        switch (model()) {
+            case LensModel::opencv: return opencv().px2_per_steradian();
+            case LensModel::fisheye: return fisheye().px2_per_steradian();
+            default: return pinhole().px2_per_steradian();
+        }
+    }
+    template <class Eye>
+    static V3DG_HD FrustumSides sides_of(const Eye eyes[2], int num_eyes, double pad_px) {
+        switch (eyes[0].model()) {
+            case LensModel::opencv: return OpenCv<T>::sides_of(eyes, num_eyes, pad_px);
+            case LensModel::fisheye: return Fisheye<T>::sides_of(eyes, num_eyes, pad_px);
+            default: return Pinhole<T>::sides_of(eyes, num_eyes, pad_px);
+        }
+    }
+    V3DG_HD double front_offset(const InstanceAxes& in, double inverse_scale) const {
+        if (model() == LensModel::fisheye) return fisheye().front_offset(in, inverse_scale);
+        return pinhole().front_offset(in, inverse_scale);
+    }
+    V3DG_HD void set_guard_direction(const InstanceAxes& in, float direction[3]) const {
+        if (is_pinhole())
+            Pinhole<T>::set_guard_direction(in, direction);
+        else
+            Distorted<T>::set_guard_direction(in, direction);
+    }
+};
+
+// Return the projection of each model; `values` are coefficients in the order of the
+// model's fields. The ranges of the model are computed here.
+template <class T>
+V3DG_HD Intrinsics<T> intrinsics_of(const Pinhole<T>& projection) {
+    return {projection, 0, {}};
+}
+inline Intrinsics<double> intrinsics_of_opencv(const Pinhole<double>& projection,
+                                               const double values[8]) {
+    OpenCv<double> lens{{projection}, {}, values[6], values[7], 0, 0};
+    for (int i = 0; i < 6; ++i) lens.k[i] = values[i];
+    lens.set_ranges();
+    Intrinsics<double> out{projection, static_cast<int64_t>(LensModel::opencv), {}};
+    for (int i = 0; i < 8; ++i) out.lens_values[i] = values[i];
+    out.lens_values[8] = lens.clamp_slope;
+    out.lens_values[9] = lens.valid_slope;
+    return out;
+}
+inline Intrinsics<double> intrinsics_of_fisheye(const Pinhole<double>& projection,
+                                                const double values[4]) {
+    Fisheye<double> lens{{projection}, {}, 0, 0, 0, 0, 0};
+    for (int i = 0; i < 4; ++i) lens.k[i] = values[i];
+    lens.set_ranges();
+    const double ranges[5] = {lens.clamp_angle, lens.clamp_sin, lens.clamp_cos, lens.valid_angle,
+                              lens.valid_cos};
+    Intrinsics<double> out{projection, static_cast<int64_t>(LensModel::fisheye), {}};
+    for (int i = 0; i < 4; ++i) out.lens_values[i] = values[i];
+    for (int i = 0; i < 5; ++i) out.lens_values[4 + i] = ranges[i];
+    return out;
+}
 
 // A camera in the world, in double precision: its pose, its camera model, and the
 // requested part of its image.
 struct Camera : CameraPose, Intrinsics<double>, ImagePart {
+    // px2_per_steradian() of the camera model, which selection needs for each instance.
+    // Not used for pinholes.
+    double density;
+
     // Returns the camera model with scalar type T.
     template <class T>
     V3DG_HD Intrinsics<T> intrinsics() const {
         return rounded_to<T>();
+    }
+    V3DG_HD double px2_per_steradian() const {
+        return is_pinhole() ? pinhole().px2_per_steradian() : density;
+    }
+    // Sets the camera model; the pose and the requested part stay.
+    void set_lens(const Intrinsics<double>& projection) {
+        static_cast<Intrinsics<double>&>(*this) = projection;
+        density = projection.px2_per_steradian();
     }
     // Returns this camera with `factor` times the resolution.
     V3DG_HD Camera scaled(double factor) const {
@@ -105,6 +268,7 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
         camera.y0 *= factor;
         camera.x1 *= factor;
         camera.y1 *= factor;
+        camera.density *= factor * factor;
         return camera;
     }
     // Returns a camera whose image is the given rectangle of this camera's image, px.
@@ -118,13 +282,14 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
         return camera;
     }
 };
-static_assert(sizeof(Camera) == 26 * sizeof(double),
+static_assert(sizeof(Camera) == 38 * sizeof(double),
               "operator== compares all bytes, so Camera must have no padding");
 
 // Returns a camera with the given projection, whose whole image is requested. The
 // caller sets the pose.
 inline Camera with_projection(const Intrinsics<double>& projection) {
-    return {CameraPose{}, projection, ImagePart{0, 0, projection.width, projection.height}};
+    return {CameraPose{}, projection, ImagePart{0, 0, projection.width, projection.height},
+            projection.px2_per_steradian()};
 }
 
 // The viewpoint for which a cut is selected: one camera, or the two eyes of a stereo
@@ -183,6 +348,7 @@ concept SelectingModel =
         { C::sides_of(eyes, 2, number) } -> std::same_as<typename C::Sides>;
         { camera.front_offset(axes, number) } -> std::same_as<double>;
         C::set_planes(sides, axes, axes, number, planes);
+        camera.set_guard_direction(axes, &planes->guard);
         requires C::kNumPlanes > 0;
     };
 
@@ -190,6 +356,8 @@ template <class C>
 concept CameraModel = ProjectingModel<C> && SelectingModel<C>;
 
 static_assert(CameraModel<Pinhole<float>> && CameraModel<Pinhole<double>>);
+static_assert(CameraModel<OpenCv<float>> && CameraModel<OpenCv<double>>);
+static_assert(CameraModel<Fisheye<float>> && CameraModel<Fisheye<double>>);
 static_assert(CameraModel<Intrinsics<float>> && CameraModel<Intrinsics<double>>);
 
 }  // namespace v3dg

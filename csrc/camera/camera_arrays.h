@@ -53,7 +53,7 @@ V3DG_HD inline CameraFault fault_of_camera(const double viewmat[16], const doubl
 // Returns the camera with this pose and these intrinsics. Its whole image is requested.
 V3DG_HD inline Camera camera_of(const double viewmat[16], const double K[9], int width, int height,
                                 double near_depth) {
-    Camera camera;
+    Camera camera{};
     for (int row = 0; row < 3; ++row) {
         for (int a = 0; a < 3; ++a) camera.rotation[3 * row + a] = viewmat[4 * row + a];
         camera.translation[row] = viewmat[4 * row + 3];

@@ -15,7 +15,8 @@ struct ImagePart {
 struct Plane {
     float normal[3], offset;
     // The linearised image of a gaussian may extend beyond the true projection of its
-    // box. `guard` bounds by how much, per unit of the box's half depth.
+    // box. `guard` bounds by how much, per unit of the box's half extent along the
+    // guard direction of the model, which for a pinhole is its depth.
     float guard;
 };
 

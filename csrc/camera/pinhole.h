@@ -191,6 +191,10 @@ struct Pinhole {
         return near_depth * inverse_scale - in.origin[2];
     }
 
+    static V3DG_HD void set_guard_direction(const InstanceAxes& in, float direction[3]) {
+        for (int k = 0; k < 3; ++k) direction[k] = static_cast<float>(in.axes[6 + k]);
+    }
+
     static V3DG_HD void set_planes(const FrustumSides& sides, const InstanceAxes& first,
                                    const InstanceAxes& second, double front_offset,
                                    Plane plane[kNumPlanes]) {

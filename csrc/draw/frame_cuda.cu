@@ -227,6 +227,7 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
              .items = items,
              .has_shared_items = batch.has_shared_items,
              .has_faded_items = batch.has_faded_items,
+             .has_lenses = batch.has_lenses,
              .factors = batch.factors,
              .num_factors = batch.num_factors,
              .image_counts = batch.image_counts},

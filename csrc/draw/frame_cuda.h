@@ -33,6 +33,7 @@ struct FrameBatch {
     // Whether any item may have a weight below 1. Such items occur only in scenes, and
     // are never shared.
     bool has_faded_items = false;
+    bool has_lenses = false;  // whether the camera of any image is not a pinhole
     // [num_factors] as in ProjectInput; may be null
     const InstanceFactors* factors = nullptr;
     uint32_t num_factors = 0;

@@ -1,3 +1,5 @@
+// Pictures of one model with their backward pass, and idle frames for the next ones.
+
 #include "draw/render_backward_cuda.h"
 
 #include <map>
@@ -53,8 +55,15 @@ void DifferentiableFrame::backward(const PictureGradient<float>& d_picture,
     rasterize_backward({in_.image, tape.lists.records, tape.lists.tile_first, tape.raster.order,
                         tape.raster.blended, tape.lists.plans, d_picture},
                        slots, d_background_of_tile.data(), d_background, stream);
-    project_backward({tape.item_records, tape.lists.records, tape.source, in_.rows, in_.view,
-                      in_.image.camera, in_.filter_px2, in_.antialiased},
+    project_backward({.item_records = tape.item_records,
+                      .records = tape.lists.records,
+                      .source = tape.source,
+                      .rows = in_.rows,
+                      .view = in_.view,
+                      .camera = in_.image.camera,
+                      .filter_px2 = in_.filter_px2,
+                      .antialiased = in_.antialiased,
+                      .has_lenses = !in_.image.camera.is_pinhole()},
                      slots, out, centers, stream);
     check(cudaEventRecord(gone_back_, stream), "cudaEventRecord");
 }

@@ -125,6 +125,7 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
                                      ? stop_of_cut(pictures.min_transmittance, rule.tolerance_px2)
                                      : pictures.min_transmittance,
             .has_faded_items = rule.fade.is_on(),
+            .has_lenses = !pictures.image[0].camera.is_pinhole(),
             .factors = factors.empty() ? nullptr : factors.data,
             .num_factors = static_cast<uint32_t>(factors.size),
             .guards_models = nullptr,
@@ -249,6 +250,7 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
                            .num_tiles = num_tiles_of(image),
                            .packed = packed == nullptr ? nullptr : &on_device->packed,
                            .min_transmittance = min_transmittance,
+                           .has_lenses = !image.camera.is_pinhole(),
                            .has_depth = image.planes.depth != nullptr};
     const unsigned blocks =
         std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));

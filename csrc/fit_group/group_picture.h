@@ -25,7 +25,7 @@ static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& came
     const Window all = square(static_cast<int>(camera.width));
     Reach unused;
     const size_t count =
-        project<float>(draw, 0, draw.count, camera, all, records, source, 0, unused);
+        project<float>(draw, 0, draw.count, intrinsics_of(camera), all, records, source, 0, unused);
     uint64_t* order = scratch.order.reserve(count);
     scratch.format = EntryFormat::of(count, 0, INT32_MAX);
     for (size_t i = 0; i < count; ++i)

@@ -26,7 +26,7 @@ template <class Fit>
 __device__ bool project_one(const Fit& fit, uint32_t i, const ModelView<float>& view,
                             const Pinhole<float>& camera, Record<float>& r) {
     const Gaussian3d<float> g = gaussian_of(fit, i);
-    Projection<float> p;
+    Projection<float, Pinhole<float>> p;
     to_view(view, g.mean, p.p);
     const Ellipse<float> e =
         project_gaussian(g, view, camera, fit.in.config.filter_px2, fit.in.config.antialiased, p);
@@ -94,7 +94,7 @@ __device__ void project_views_backward(const Fit& fit, const FitCameras& cameras
         const float filter_px2 = fit.in.config.filter_px2;
         const bool antialiased = fit.in.config.antialiased;
         const Gaussian3d<float> g = gaussian_of(fit, i);
-        Projection<float> p;
+        Projection<float, Pinhole<float>> p;
         to_view(view, g.mean, p.p);
         const Ellipse<float> e = project_gaussian(g, view, camera, filter_px2, antialiased, p);
         const Ellipse<float> d_ellipse = falloff_vjp(e.l11, e.l12, e.l22,

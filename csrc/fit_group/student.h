@@ -78,7 +78,7 @@ class Student {
                                       .sh = g + 11 * n_,
                                       .size = n_,
                                       .sh_degree = model_.sh_degree};
-        project_backward<float>(draw, source, d_records, count, camera, out);
+        project_backward<float>(draw, source, d_records, count, intrinsics_of(camera), out);
         for (size_t i = 0; i < count; ++i) {
             const size_t gaussian = source[i];
             for (int k = 0; k < 3; ++k) gradient_[3 * gaussian + k] += out.means[3 * gaussian + k];

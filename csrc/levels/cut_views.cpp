@@ -209,7 +209,7 @@ Camera camera_at(const Surroundings& ball, double distance, const double outward
                  const double right[3], const Pinhole<double>& projection) {
     double down[3];
     cross3(right, outwards, down);
-    Camera camera = with_projection(projection);
+    Camera camera = with_projection(intrinsics_of(projection));
     for (int k = 0; k < 3; ++k) {
         camera.rotation[k] = right[k];
         camera.rotation[3 + k] = down[k];

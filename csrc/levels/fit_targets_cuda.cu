@@ -56,7 +56,7 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
         const FitView view = t.views[job.first_view + p.picture];
         const int size = t.config.supersample * view.size;
         FrameImage image{};
-        image.camera = camera_of(view, static_cast<float>(t.config.supersample));
+        image.camera = intrinsics_of(camera_of(view, static_cast<float>(t.config.supersample)));
         image.width = image.height = size;
         image.tile_columns = (size + kFrameTileWidth - 1) / kFrameTileWidth;
         image.tile_rows = (size + kFrameTileHeight - 1) / kFrameTileHeight;

@@ -95,6 +95,8 @@ V3DG_HD inline float exp2_in_range(float x) {
 V3DG_HD inline double exp2_in_range(double x) { return ::exp2(x); }
 V3DG_HD inline float log2_of(float x) { return ::log2f(x); }
 V3DG_HD inline double log2_of(double x) { return ::log2(x); }
+V3DG_HD inline float atan2_of(float y, float x) { return ::atan2f(y, x); }
+V3DG_HD inline double atan2_of(double y, double x) { return ::atan2(y, x); }
 
 V3DG_HD inline float float_of_bits(uint32_t bits) {
     float x;

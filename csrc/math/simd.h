@@ -142,6 +142,15 @@ V3DG_INLINE Vec<double> log2_of(Vec<double> x) {
     return x;
 }
 
+V3DG_INLINE Vec<float> atan2_of(Vec<float> y, Vec<float> x) {
+    for (int i = 0; i < kLanes<float>; ++i) x[i] = ::atan2f(y[i], x[i]);
+    return x;
+}
+V3DG_INLINE Vec<double> atan2_of(Vec<double> y, Vec<double> x) {
+    for (int i = 0; i < kLanes<double>; ++i) x[i] = ::atan2(y[i], x[i]);
+    return x;
+}
+
 template <class V>
 V3DG_INLINE auto to_int(V x) {
     return __builtin_convertvector(x, decltype(x < x));

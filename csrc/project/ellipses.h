@@ -34,14 +34,20 @@ struct EllipsesInput {
     T far_depth, min_radius_px;
 
     V3DG_HD void write(size_t i, const Ellipses<T>& out) const {
+        camera.visit([&](const auto& model) { write_by(model, i, out); });
+    }
+
+  private:
+    template <ProjectingModel C>
+    V3DG_HD void write_by(const C& model, size_t i, const Ellipses<T>& out) const {
         Gaussian3d<T> g;
         for (int k = 0; k < 3; ++k) g.mean[k] = rows.means[3 * i + k];
         for (int k = 0; k < 4; ++k) g.quat[k] = rows.quats[4 * i + k];
         for (int k = 0; k < 3; ++k) g.scale[k] = rows.scales[3 * i + k];
         g.opacity = rows.opacities[i];
-        Projection<T> s;
+        Projection<T, C> s;
         to_view(view, g.mean, s.p);
-        const Ellipse<T> e = project_gaussian(g, view, camera, filter_px2, antialiased, s);
+        const Ellipse<T> e = project_gaussian(g, view, model, filter_px2, antialiased, s);
         T half_x, half_y;
         const bool is_drawable = extent_of(g.opacity, e, s, half_x, half_y);
         const int32_t x = rounded_up(half_x), y = rounded_up(half_y);
@@ -62,7 +68,6 @@ struct EllipsesInput {
         out.radii[2 * i + 1] = is_seen ? y : 0;
     }
 
-  private:
     // Rounds up to an integer, at most 2^30. The result is undefined for NaN.
     static V3DG_HD int32_t rounded_up(T x) {
         const auto whole = static_cast<int32_t>(min_of(max_of(x, T(0)), T(1 << 30)));

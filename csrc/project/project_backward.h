@@ -29,6 +29,7 @@ struct ProjectBackwardInput {
     Intrinsics<float> camera;  // of the only picture; unused with an ItemBatch
     float filter_px2;
     bool antialiased;
+    bool has_lenses;  // whether the camera of any picture is no pinhole
 };
 // The items of several pictures of one model. An item has at most kItemSize gaussians.
 // The records of item i begin at i * kItemSize.

@@ -136,15 +136,14 @@ __device__ const ModelView<float>& view_of_block(const ProjectBackwardInput& in,
     if constexpr (kIsBatch) return batch.placements[batch.items[blockIdx.x].placement].view;
     return in.view;
 }
-template <bool kIsBatch>
-__device__ const Intrinsics<float>& camera_of_block(const ProjectBackwardInput& in,
-                                                    const ItemBatch& batch) {
+template <bool kIsBatch, class C>
+__device__ const C& camera_of_block(const ProjectBackwardInput& in, const ItemBatch& batch) {
     if constexpr (kIsBatch)
         return batch.images[batch.placements[batch.items[blockIdx.x].placement].image].camera;
     return in.camera;
 }
 
-template <int kDegree, bool kIsBatch>
+template <int kDegree, bool kIsBatch, class C>
 __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     project_backward_kernel(ProjectBackwardInput in, ItemBatch batch, GradientSlots slots,
                             GaussianRows<float> out, float* d_centers) {
@@ -210,9 +209,9 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     const uint64_t first_out = kIsBatch ? first_record : first;
     if (used) {
         const ModelView<float>& view = view_of_block<kIsBatch>(in, batch);
-        const Intrinsics<float>& camera = camera_of_block<kIsBatch>(in, batch);
+        const C& camera = camera_of_block<kIsBatch, C>(in, batch);
         const uint64_t row_out = first_out + (i - first);
-        Projection<float> s;
+        Projection<float, C> s;
         to_view(view, g.mean, s.p);
         const Ellipse<float> e =
             project_gaussian(g, view, camera, in.filter_px2, in.antialiased, s);
@@ -259,13 +258,22 @@ __global__ void __launch_bounds__(kThreads)
         sizes[in.source[record]] = size;
 }
 
-template <int kDegree, bool kIsBatch>
-void start(const ProjectBackwardInput& in, const ItemBatch& batch, const GradientSlots& slots,
-           const GaussianRows<float>& out, float* d_centers, cudaStream_t stream) {
-    launch("project_backward_kernel", &project_backward_kernel<kDegree, kIsBatch>,
+template <int kDegree, bool kIsBatch, class C>
+void start_by(const ProjectBackwardInput& in, const ItemBatch& batch, const GradientSlots& slots,
+              const GaussianRows<float>& out, float* d_centers, cudaStream_t stream) {
+    launch("project_backward_kernel", &project_backward_kernel<kDegree, kIsBatch, C>,
            kIsBatch ? batch.num_items : blocks_for(in.rows.size, kItemSize), kThreads,
            kThreads * ShRow<kDegree>::kStride * sizeof(typename ShRow<kDegree>::Word), stream, in,
            batch, slots, out, d_centers);
+}
+
+template <int kDegree, bool kIsBatch>
+void start(const ProjectBackwardInput& in, const ItemBatch& batch, const GradientSlots& slots,
+           const GaussianRows<float>& out, float* d_centers, cudaStream_t stream) {
+    if (in.has_lenses)
+        start_by<kDegree, kIsBatch, Intrinsics<float>>(in, batch, slots, out, d_centers, stream);
+    else
+        start_by<kDegree, kIsBatch, Pinhole<float>>(in, batch, slots, out, d_centers, stream);
 }
 
 template <bool kIsBatch>

@@ -121,9 +121,9 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
 }
 
 // Implements project() for one source. `first` is the row of the first gaussian.
-template <class Source, class T>
+template <class Source, class T, ProjectingModel C>
 static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t first, uint64_t count,
-                           const Intrinsics<T>& camera, const Window& window, Record<T>* records,
+                           const C& camera, const Window& window, Record<T>* records,
                            uint32_t* source, uint32_t source_base, Reach& reach) {
     using V = Vec<T>;
     using I = decltype(V{} < V{});
@@ -135,7 +135,7 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         const unsigned lanes =
             count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
         const Gaussian3d<V> g = from.load_gaussians(at, count - done);
-        Projection<V> s;
+        Projection<V, C> s;
         to_view(draw.view, g.mean, s.p);
         const auto in_front = camera.depth_of(s.p) >= all_lanes<V>(camera.near_depth);
         if ((bits_of(in_front) & lanes) == 0) continue;
@@ -184,10 +184,10 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
 }
 
 // Implements project() for codes, one cluster after another.
-static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t count,
-                            const Intrinsics<float>& camera, const Window& window,
-                            Record<float>* records, uint32_t* source, uint32_t source_base,
-                            Reach& reach) {
+template <ProjectingModel C>
+static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t count, const C& camera,
+                            const Window& window, Record<float>* records, uint32_t* source,
+                            uint32_t source_base, Reach& reach) {
     const Codes& codes = *draw.codes;
     const uint64_t start = draw.first + skip, end = start + count;
     size_t num_records = 0;
@@ -211,20 +211,22 @@ template <class T>
 size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrinsics<T>& camera,
                const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
                Reach& reach) {
-    if constexpr (std::is_same<T, float>::value)
-        if (draw.codes != nullptr)
-            return project_codes(draw, skip, count, camera, window, records, source, source_base,
-                                 reach);
-    return project_rows(PlaneSource<T>{*draw.model}, draw, draw.first + skip, count, camera, window,
-                        records, source, source_base, reach);
+    return camera.visit([&](const auto& model) {
+        if constexpr (std::is_same<T, float>::value)
+            if (draw.codes != nullptr)
+                return project_codes(draw, skip, count, model, window, records, source, source_base,
+                                     reach);
+        return project_rows(PlaneSource<T>{*draw.model}, draw, draw.first + skip, count, model,
+                            window, records, source, source_base, reach);
+    });
 }
 
 // Fill the lanes one by one, because the gaussians of adjacent records are scattered in
 // memory. Filling costs little compared to the arithmetic.
-template <class T>
-void project_backward(const Draw<T>& draw, const uint32_t* source,
-                      const RecordGradient<T>* d_records, size_t count, const Intrinsics<T>& camera,
-                      const GaussianRows<T>& out) {
+template <class T, ProjectingModel C>
+static void project_backward_by(const C& camera, const Draw<T>& draw, const uint32_t* source,
+                                const RecordGradient<T>* d_records, size_t count,
+                                const GaussianRows<T>& out) {
     using V = Vec<T>;
     constexpr size_t kWidth = kLanes<T>;
     const GaussianPlanes<T>& m = *draw.model;
@@ -255,7 +257,7 @@ void project_backward(const Draw<T>& draw, const uint32_t* source,
             d.depth[i] = r.ellipse.depth;
             for (int c = 0; c < 3; ++c) d_color[c][i] = r.color[c];
         }
-        Projection<V> s;
+        Projection<V, C> s;
         to_view(draw.view, g.mean, s.p);
         const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
                                               draw.appearance.antialiased, s);
@@ -274,6 +276,15 @@ void project_backward(const Draw<T>& draw, const uint32_t* source,
             for (int k = 0; k < num_sh; ++k) out.sh[num_sh * at + k] = d_sh[k][i];
         }
     }
+}
+
+template <class T>
+void project_backward(const Draw<T>& draw, const uint32_t* source,
+                      const RecordGradient<T>* d_records, size_t count, const Intrinsics<T>& camera,
+                      const GaussianRows<T>& out) {
+    camera.visit([&](const auto& model) {
+        project_backward_by(model, draw, source, d_records, count, out);
+    });
 }
 
 #define V3DG_INSTANTIATE(T)                                                                      \

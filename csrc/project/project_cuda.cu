@@ -39,7 +39,7 @@ constexpr unsigned kNearlyAll = 22, kMany = 12;
 // Projects the item whose tables the warp has loaded, and returns its number of
 // records. `factors` points to the factors of the item's placement or, in a shared
 // item, of all its placements. It is null if the source has no factors.
-template <class Source, bool kIsShared>
+template <class Source, bool kIsShared, class C>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
                                  const InstanceFactors* factors, FrameCounters& counters,
                                  const ProjectOutput& out, unsigned& num_in_frustum) {
@@ -56,7 +56,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         if (sees) is_faint = factors[kIsShared ? lane : 0].opacity < 1;
     const auto reach_scale_of = [&] {
         const float* linear = view.linear;
-        return tables.image.camera.sphere_scale(
+        return camera_as<C>(tables).sphere_scale(
             tables.limits, linear[6] * linear[6] + linear[7] * linear[7] + linear[8] * linear[8]);
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
@@ -83,12 +83,12 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             to_view(view, mean, mine.p);
             if (are_tested) {
                 const SphereTest told =
-                    test_sphere<Source>(tables, mine.p, sphere.w, reach_scale, is_faint);
+                    test_sphere<Source, C>(tables, mine.p, sphere.w, reach_scale, is_faint);
                 may_reach = told.may_reach;
                 is_small = may_reach && told.half < kSmall;
                 num_in_frustum += told.misses_centers;
             } else {
-                const Intrinsics<float>& cam = tables.image.camera;
+                const C& cam = camera_as<C>(tables);
                 may_reach = cam.depth_of(mine.p) >= cam.near_depth && !(sphere.w < 0);
             }
         }
@@ -112,8 +112,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             are_tested = !are_nearly_all || waiting > 0;
         }
         const unsigned num_records =
-            write_records<Source, kIsShared>(space, sharers, factors, start, traits, may_reach,
-                                             mine, record, counters, out, num_in_frustum);
+            write_records<Source, kIsShared, C>(space, sharers, factors, start, traits, may_reach,
+                                                mine, record, counters, out, num_in_frustum);
         record += num_records;
         are_tested = are_tested || num_records < kMany;
         __syncwarp();  // the next iteration overwrites the queue and the records
@@ -165,7 +165,7 @@ __device__ const InstanceFactors* factors_for(const ProjectInput& in, const Draw
         return nullptr;
 }
 
-template <class Source>
+template <class Source, class C>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out,
                    unsigned* taken) {
@@ -192,7 +192,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         store_tables(space.tables, item_word, placement_word, in, models, loaded);
         if (space.tables.item.sharers == 0 && Source::has(space.tables.model)) {
             const unsigned before = num_in_frustum;
-            const unsigned written = project_item<Source, false>(
+            const unsigned written = project_item<Source, false, C>(
                 space, nullptr, factors_for<Source>(in, space.tables.item), *in.items.counters, out,
                 num_in_frustum);
             num_records += written;
@@ -207,7 +207,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 }
 
 // Most frames have few shared items, so a warp examines 32 items at once to find them.
-template <class Source>
+template <class Source, class C>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_shared_kernel(ProjectInput in, const typename Source::Model* models,
                           ProjectOutput out) {
@@ -238,8 +238,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
             if (!Source::has(space.tables.model)) continue;
             const unsigned before = num_in_frustum;
             const unsigned written =
-                project_item<Source, true>(space, sharers, factors_for<Source>(in, item),
-                                           *in.items.counters, out, num_in_frustum);
+                project_item<Source, true, C>(space, sharers, factors_for<Source>(in, item),
+                                              *in.items.counters, out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
             if (in.image_counts != nullptr)
@@ -254,14 +254,14 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 
 // Launches the kernels for one source. `SharedSource` reads the models of shared items;
 // it has no fades, because shared items have weight 1.
-template <class Source, class SharedSource>
+template <class Source, class SharedSource, class C = Pinhole<float>>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, int taken, cudaStream_t stream) {
     const unsigned blocks = kBlocks * num_multiprocessors();
-    launch_early("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in,
+    launch_early("project_kernel", project_kernel<Source, C>, blocks, 32 * kWarps, 0, stream, in,
                  models, out, out.taken + taken);
     if (in.has_shared_items)
-        launch_early("project_shared_kernel", project_shared_kernel<SharedSource>, blocks,
+        launch_early("project_shared_kernel", project_shared_kernel<SharedSource, C>, blocks,
                      32 * kWarps, 0, stream, in, models, out);
 }
 
@@ -277,7 +277,13 @@ static void project_instances(const typename Source::Model* models, const Projec
 template <class Source>
 static void project_scene(const typename Source::Model* models, const ProjectInput& in,
                           const ProjectOutput& out, int taken, cudaStream_t stream) {
-    if (in.factors != nullptr)
+    // Frames with lenses have fewer kernels: an item that is not faded has weight 1.
+    if (in.has_lenses && in.factors != nullptr)
+        project_from<Faded<Tinted<Source>>, Tinted<Source>, Intrinsics<float>>(models, in, out,
+                                                                               taken, stream);
+    else if (in.has_lenses)
+        project_from<Faded<Source>, Source, Intrinsics<float>>(models, in, out, taken, stream);
+    else if (in.factors != nullptr)
         project_instances<Tinted<Source>>(models, in, out, taken, stream);
     else
         project_instances<Source>(models, in, out, taken, stream);
@@ -286,7 +292,10 @@ static void project_scene(const typename Source::Model* models, const ProjectInp
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {
     if (in.packed != nullptr) project_scene<PackedSource>(in.packed, in, out, 0, stream);
     if (in.coded != nullptr) project_scene<CodeSource>(in.coded, in, out, 1, stream);
-    if (in.packed == nullptr && in.coded == nullptr)
+    if (in.packed != nullptr || in.coded != nullptr) return;
+    if (in.has_lenses)
+        project_from<RowSource, RowSource, Intrinsics<float>>(in.models, in, out, 0, stream);
+    else
         project_from<RowSource, RowSource>(in.models, in, out, 0, stream);
 }
 

@@ -31,6 +31,7 @@ struct ProjectInput {
     bool has_shared_items;  // whether any item may be shared by several placements
     // Whether any item may have a weight below 1. Such items are not shared.
     bool has_faded_items;
+    bool has_lenses;  // whether the camera of any image is not a pinhole
     // Opacity and colour factors of the instances; null if all are 1. Placement p has
     // the factors at index p modulo num_factors.
     const InstanceFactors* factors;

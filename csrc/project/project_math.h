@@ -19,7 +19,7 @@
 namespace v3dg {
 
 // Intermediate results of the projection. The backward pass reuses them.
-template <class V, ProjectingModel C = Intrinsics<Lane<V>>>
+template <class V, ProjectingModel C>
 struct Projection {
     V p[3];          // mean, in view space
     V linear_rs[9];  // W R S: the gaussian's axes in view space

@@ -23,8 +23,15 @@ struct ItemTables {
     alignas(16) FrameImage image;
     alignas(16) Model model;
     DrawItem item;
-    Intrinsics<float>::Limits limits;  // limits of the image's camera
+    SlopeLimits<float> limits;  // limits of the image's camera
 };
+
+// Returns the image's camera as a model: a pinhole if all images have pinholes, else
+// Intrinsics.
+template <class C, class Model>
+__device__ const C& camera_as(const ItemTables<Model>& in) {
+    return in.image.camera;
+}
 
 __device__ inline float4 load4(const float* rows, uint32_t row) {
     return __ldg(reinterpret_cast<const float4*>(rows) + row);
@@ -85,9 +92,10 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
         return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2], reach_of(gaussian)};
     }
+    template <class C>
     static __device__ Ellipse<float> project(const ItemTables<Model>& in,
                                              const ModelView<float>& view, Place&, uint32_t g,
-                                             Projection<float>& s, float color[3]) {
+                                             Projection<float, C>& s, float color[3]) {
         const GaussianRows<const float>& m = in.model;
         Gaussian3d<float> gaussian{{}, {}, {}, __ldg(m.opacities + g)};
         for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
@@ -102,7 +110,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         else if (m.sh_degree == kPlainColor)
             color_of_row<kPlainColor>(sh, gaussian.mean, view, color);
         const Appearance<float>& look = in.item.appearance;
-        return project_gaussian(gaussian, view, in.image.camera, look.filter_px2, look.antialiased,
+        return project_gaussian(gaussian, view, camera_as<C>(in), look.filter_px2, look.antialiased,
                                 s, look.is_limited);
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&,
@@ -128,16 +136,17 @@ struct PackedSource : OfRows<PackedPlanes> {
         return m.palette.sh != nullptr || m.sh_degree > 0;
     }
     static __device__ float4 fetch(const Model& m, uint32_t g) { return load4(m.plane[0], g); }
+    template <class C>
     static __device__ Ellipse<float> project(const ItemTables<Model>& in,
                                              const ModelView<float>& view, Place&, uint32_t g,
-                                             Projection<float>& s, float color[3]) {
+                                             Projection<float, C>& s, float color[3]) {
         const PackedPlanes& m = in.model;
         const float4 a = load4(m.plane[1], g), b = load4(m.plane[2], g), c = load4(m.plane[3], g);
         color[0] = c.y;
         color[1] = c.z;
         color[2] = c.w;
         const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
-        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance, s);
+        return project_packed(gaussian, view, camera_as<C>(in), in.limits, in.item.appearance, s);
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&,
                                  uint32_t g, float color[3]) {
@@ -231,9 +240,10 @@ struct CodeSource {
         return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2],
                 sigmas < 0 ? -1.0f : most * sigmas};
     }
+    template <class C>
     static __device__ Ellipse<float> project(const ItemTables<Model>& in,
                                              const ModelView<float>& view, Place& place, uint32_t g,
-                                             Projection<float>& s, float color[3]) {
+                                             Projection<float, C>& s, float color[3]) {
         const uint4 record = fetch(in.model, g);
         advance(in.model, place, g);
         float sh[3];
@@ -241,7 +251,7 @@ struct CodeSource {
         color_of_sh(0, gaussian.mean, sh, color);
         PackedGaussian packed = pack_gaussian(gaussian);
         packed.log2_opacity = opacity_table()[record.x >> 24].log2_opacity;
-        return project_packed(packed, view, in.image.camera, in.limits, in.item.appearance, s);
+        return project_packed(packed, view, camera_as<C>(in), in.limits, in.item.appearance, s);
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place& place,
                                  uint32_t g, float color[3]) {
@@ -288,10 +298,11 @@ template <class Source>
 struct Faded : Source {
     static constexpr bool kFades = true;
 
+    template <class C>
     static __device__ Ellipse<float> project(const ItemTables<typename Source::Model>& in,
                                              const ModelView<float>& view,
                                              typename Source::Place& place, uint32_t g,
-                                             Projection<float>& s, float color[3]) {
+                                             Projection<float, C>& s, float color[3]) {
         Ellipse<float> e = Source::project(in, view, place, g, s, color);
         fade(in.item.weight, e);
         return e;

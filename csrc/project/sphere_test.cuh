@@ -19,10 +19,10 @@ struct SphereTest {
 
 // Tests a gaussian at p in view space. `is_faint`: its instance has an opacity below 1.
 // The function has no branches, because the lanes of a warp would diverge.
-template <class Source>
+template <class Source, class C>
 __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3],
                                   float reach, float reach_scale, bool is_faint) {
-    const Intrinsics<float>& cam = in.image.camera;
+    const C& cam = camera_as<C>(in);
     const auto [u, v, half] =
         cam.image_of_sphere(p, reach, reach_scale, in.item.appearance.filter_px2);
     const float middle_x = 0.5f * cam.width, middle_y = 0.5f * cam.height;
@@ -41,8 +41,9 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
 
 // Removes the first and the last row from a pixel box if the ellipse reaches no pixel
 // centre in that row. A margin covers rounding, so that only the blend step decides.
-__device__ inline void drop_missed_rows(const Ellipse<float>& e, const Projection<float>& s,
-                                        float image_width, PixelBox<int>& box) {
+template <class C>
+__device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float, C>& s,
+                                 float image_width, PixelBox<int>& box) {
     const float slope = quotient_of(s.c12, s.c22), u = e.u - 0.5f;
     const float margin = 2e-3f + 4e-7f * (2 * fabsf(e.u) + image_width);
     const float reach = e.log2_opacity - static_cast<float>(kLog2MinAlpha) + 1e-4f;

@@ -53,6 +53,13 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
+// Copies a table of any size with a warp.
+template <class T>
+__device__ void copy_table(T& to, const T& from) {
+    for (unsigned k = threadIdx.x % 32; k < sizeof(T) / sizeof(uint32_t); k += 32)
+        reinterpret_cast<uint32_t*>(&to)[k] = __ldg(reinterpret_cast<const uint32_t*>(&from) + k);
+}
+
 // The image and the model whose tables are in the warp's shared memory.
 struct Loaded {
     uint32_t image = ~0u, model = ~0u;
@@ -69,7 +76,7 @@ __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint
     __syncwarp();
     if (tables.placement.image != loaded.image) {
         loaded.image = tables.placement.image;
-        store_word(tables.image, load_word(in.images[loaded.image]));
+        copy_table(tables.image, in.images[loaded.image]);
         __syncwarp();
         if (threadIdx.x % 32 == 0) tables.limits = tables.image.camera.limits();
     }

@@ -22,18 +22,18 @@ struct ItemTraits {
 // the result is also true for a few gaussians that reach none. There is no early
 // return, not even if the lane has no gaussian (!is_one), because all lanes of a warp
 // stay together.
-template <class Source>
+template <class Source, class C>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in,
                             const ModelView<float>& view, typename Source::Place place, uint32_t g,
                             const float p[3], bool is_one, const ItemTraits& traits,
                             const InstanceFactors* factors, Record<float>& r, PixelBox<int>& box,
                             unsigned& num_in_frustum) {
-    Projection<float> s;
+    Projection<float, C> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
     Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
     if constexpr (Source::kTints) fade(factors->opacity, e);
     float half_x, half_y;
-    const Intrinsics<float>& cam = in.image.camera;
+    const C& cam = camera_as<C>(in);
     // Pass 1 as opacity: the sphere test has removed gaussians that are too faint.
     bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
     is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
@@ -52,7 +52,7 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
 // adds them to the counts of tiles. Returns the number of records. `sharers` are the
 // placements of a shared item. `factors` points to the factors of the sharers or, if
 // the item is not shared, of its placement. It is null if the source has no factors.
-template <class Source, bool kIsShared>
+template <class Source, bool kIsShared, class C>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
                                   const Placement* sharers, const InstanceFactors* factors,
                                   const typename Source::Place& start, const ItemTraits& traits,
@@ -67,7 +67,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
     const ModelView<float>& view = kIsShared ? sharers[place % 32].view : in.placement.view;
     Record<float> r;
     PixelBox<int> box;
-    const bool reaches_pixel = project_one<Source>(
+    const bool reaches_pixel = project_one<Source, C>(
         in, view, start, g, mine.p, has_one, traits,
         Source::kTints && kIsShared ? factors + place % 32 : factors, r, box, num_in_frustum);
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);

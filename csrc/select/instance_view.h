@@ -17,7 +17,8 @@ constexpr int kNumPlanes = Intrinsics<double>::kNumPlanes;
 struct alignas(16) InstanceView {
     float eye[3], other_eye[3];
     bool has_other_eye;
-    float forward[3];         // viewing direction, unit length
+    // Viewing direction of a pinhole, unit length; the guard direction of other models.
+    float forward[3];
     float px2_per_steradian;  // the camera's value times the instance's importance
     Plane plane[kNumPlanes];  // a gaussian outside of any plane is not drawn
 };
@@ -52,7 +53,7 @@ V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const CameraSid
     view.has_other_eye = eyes.are_two;
     for (int k = 0; k < 3; ++k) view.eye[k] = static_cast<float>(in.eye[k]);
     for (int k = 0; k < 3; ++k) view.other_eye[k] = static_cast<float>(other.eye[k]);
-    for (int k = 0; k < 3; ++k) view.forward[k] = static_cast<float>(in.axes[6 + k]);
+    camera.set_guard_direction(in, view.forward);
     Intrinsics<double>::set_planes(sides, in, other, front, view.plane);
     return view;
 }

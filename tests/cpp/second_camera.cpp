@@ -92,6 +92,9 @@ struct Orthographic {
     double front_offset(const InstanceAxes& in, double inverse_scale) const {
         return near_depth * inverse_scale - in.origin[2];
     }
+    static void set_guard_direction(const InstanceAxes& in, float direction[3]) {
+        for (int k = 0; k < 3; ++k) direction[k] = static_cast<float>(in.axes[6 + k]);
+    }
     static void set_planes(const Edges&, const InstanceAxes& first, const InstanceAxes&,
                            double front_offset, Plane* plane) {
         for (int k = 0; k < 3; ++k) plane->normal[k] = static_cast<float>(-first.axes[6 + k]);

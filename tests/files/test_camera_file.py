@@ -1,6 +1,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -91,17 +92,28 @@ def test_applied_transform_is_undone_on_request(tmp_path):
     np.testing.assert_allclose(2 * (undone.viewmat @ [*point, 1])[:3], seen[:3], atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["k1", "k3", "k6", "p2"])
-def test_distortion_is_refused_or_ignored(tmp_path, name):
+@pytest.mark.parametrize("name", ["k1", "k2", "p1", "p2", "k3"])
+def test_distortion_is_read_or_ignored(tmp_path, name):
     path = put(tmp_path, {**CAPTURE, name: 0.01})
-    with pytest.raises(
-        ValueError, match=f"^transforms.json: {name}: expected no lens distortion, got 0.01; "
-    ):
-        read_cameras(path)
+    camera = next(iter(read_cameras(path).values()))
+    order = ("k1", "k2", "p1", "p2", "k3")
+    assert camera.model == "OPENCV"
+    assert camera.distortion == tuple(0.01 * (term == name) for term in order)
     ignored = next(iter(read_cameras(path, distortion="ignore").values()))
+    assert (ignored.model, ignored.distortion) == ("PINHOLE", ())
     np.testing.assert_array_equal(
         ignored.K, read_cameras(put(tmp_path, CAPTURE))["images/frame_1.png"].K
     )
+
+
+def test_all_coefficients_of_opencv_are_read_and_written(tmp_path):
+    coefficients = {f"k{number}": 0.01 * number for number in range(1, 7)}
+    full = {**CAPTURE, "camera_model": "FULL_OPENCV", **coefficients, "p2": 0.002}
+    camera = read_cameras(put(tmp_path, full))["images/frame_1.png"]
+    assert camera.model == "OPENCV"
+    assert camera.distortion == pytest.approx((0.01, 0.02, 0, 0.002, 0.03, 0.04, 0.05, 0.06))
+    write_cameras(tmp_path / "again.json", {"a": camera})
+    assert read_cameras(tmp_path / "again.json")["a"].distortion == camera.distortion
 
 
 def test_a_lens_of_opencv_with_all_coefficients_zero_is_a_pinhole(tmp_path):
@@ -207,17 +219,17 @@ BAD = {
         "frames[0].fov_y: expected radians between 0 and pi, got 5e-324",
     ),
     "principal point of another kind": ({**CAPTURE, "cx": True}, "cx: expected a number, got true"),
-    "fisheye": (
-        {**CAPTURE, "camera_model": "OPENCV_FISHEYE"},
-        "camera_model: expected a pinhole camera (PINHOLE, SIMPLE_PINHOLE, OPENCV, FULL_OPENCV, "
-        "SIMPLE_RADIAL, RADIAL), "
-        'got "OPENCV_FISHEYE"; undistort the pictures first',
+    "another model": (
+        {**CAPTURE, "camera_model": "EQUIRECTANGULAR"},
+        "camera_model: expected a camera model of OpenCV (PINHOLE, SIMPLE_PINHOLE, OPENCV, "
+        "FULL_OPENCV, SIMPLE_RADIAL, RADIAL, OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, "
+        'RADIAL_FISHEYE), got "EQUIRECTANGULAR"; undistort the pictures first',
     ),
-    "fisheye of instant-ngp": (
-        {**CAPTURE, "is_fisheye": True},
-        "is_fisheye: expected a pinhole camera",
+    "fourth coefficient, which OpenCV has not": (
+        with_frame(k4=-0.1),
+        "frames[1].k4: expected 0 unless the camera is a fisheye or a FULL_OPENCV, got -0.1",
     ),
-    "distortion of one frame": (with_frame(k2=-0.1), "frames[1].k2: expected no lens distortion"),
+    "coefficient of another kind": (with_frame(k2="a"), "frames[1].k2: expected a number"),
     "name of another kind": (
         with_frame(file_path=7),
         "frames[1].file_path: expected a string, got 7",
@@ -233,11 +245,27 @@ def test_bad_values_are_named_by_their_place(tmp_path, case):
         read_cameras(put(tmp_path, document))
 
 
-def test_distortion_is_refused_with_what_leaves_it_out(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"distortion='ignore' in Python, --distortion ignore in a command$"
-    ):
-        read_cameras(put(tmp_path, with_frame(k2=-0.1)))
+@pytest.mark.parametrize("sign", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_fisheyes_are_read(tmp_path, sign):
+    path = put(tmp_path, {**CAPTURE, **sign, "k1": 0.1, "k4": 0.02})
+    camera = next(iter(read_cameras(path).values()))
+    assert (camera.model, camera.distortion) == ("OPENCV_FISHEYE", (0.1, 0, 0, 0.02))
+    with pytest.raises(ValueError, match=r"expected a pinhole camera, got .*; draw the distor"):
+        read_cameras(path, distortion="ignore")
+
+
+def test_lenses_that_are_written_read_back(tmp_path):
+    K = np.array([[50.0, 0, 30], [0, 60, 20], [0, 0, 1]])
+    lens = {
+        "fisheye": Camera(np.eye(4), K, 64, 48, 0.5, (0.1, 0.2, 0.3, 0.4), "OPENCV_FISHEYE"),
+        "barrel": Camera(np.eye(4), K, 64, 48, 0.5, (-0.1, 0.2, 0.01, 0.02, 0.3), "OPENCV"),
+        "plain": Camera(np.eye(4), K, 64, 48),
+    }
+    path = tmp_path / "transforms.json"
+    write_cameras(path, lens)
+    again = read_cameras(path)
+    for name, camera in lens.items():
+        assert (again[name].model, again[name].distortion) == (camera.model, camera.distortion)
 
 
 def test_an_applied_transform_that_scales_is_not_undone(tmp_path):

@@ -58,18 +58,19 @@ def test_models_of_colmap_are_read(tmp_path, cameras, text, place):
         assert_same(read_cameras(tmp_path / "scene" / place / name), cameras)
 
 
-def test_distortion_is_refused_or_left_out(tmp_path, cameras):
+def test_distortion_is_read_or_left_out(tmp_path, cameras):
     write_model(tmp_path / "a", cameras, model="OPENCV", extra=(0.1, 0, 0, 0))
-    with pytest.raises(
-        ValueError, match="a pinhole without lens distortion, got OPENCV; undistort the pict"
-    ):
-        read_cameras(tmp_path / "a")
-    assert_same(read_cameras(tmp_path / "a", distortion="ignore"), cameras)
+    assert {camera.model for camera in read_cameras(tmp_path / "a").values()} == {"OPENCV"}
+    ignored = read_cameras(tmp_path / "a", distortion="ignore")
+    assert_same(ignored, cameras)
+    assert {camera.model for camera in ignored.values()} == {"PINHOLE"}
     write_model(tmp_path / "fish", cameras, model="OPENCV_FISHEYE", extra=(0, 0, 0, 0))
-    with pytest.raises(ValueError, match="got OPENCV_FISHEYE"):
+    with pytest.raises(ValueError, match="got OPENCV_FISHEYE; draw its distortion"):
         read_cameras(tmp_path / "fish", distortion="ignore")
     write_model(tmp_path / "none", cameras, model="OPENCV", extra=(0, 0, 0, 0))
-    assert_same(read_cameras(tmp_path / "none"), cameras)
+    plain = read_cameras(tmp_path / "none")
+    assert_same(plain, cameras)
+    assert {camera.model for camera in plain.values()} == {"PINHOLE"}
 
 
 def test_folders_without_cameras_are_refused(tmp_path, cameras):
@@ -177,9 +178,32 @@ def test_rigs_place_their_cameras(tmp_path, text):
         np.testing.assert_allclose(found[image.name].viewmat[:3], wanted, atol=1e-9)
 
 
+OPENCV_MODELS = {
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+}
+
+
+def assert_maps_as_colmap(camera, theirs):
+    points = np.array([[0.1, 0.2, 1.0], [-0.4, 0.1, 1.3], [0.3, -0.5, 0.9], [0.0, 0.3, 2.0]])
+    directions = camera.directions(theirs.img_from_cam(points))
+    np.testing.assert_allclose(
+        directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        points / np.linalg.norm(points, axis=1, keepdims=True),
+        atol=1e-9,
+    )
+
+
 def test_all_models_of_colmap_are_known(tmp_path):
-    """Which are pinholes, how many parameters they have, and when they are without
-    distortion is what COLMAP says."""
+    """Which are pinholes, how many parameters they have, when they are without
+    distortion, and where they map points is what COLMAP says."""
     for name, kind in pycolmap.CameraModelId.__members__.items():
         if name == "INVALID":
             continue
@@ -199,13 +223,13 @@ def test_all_models_of_colmap_are_known(tmp_path):
             is_pinhole = theirs.is_perspective_pinhole()
             # COLMAP calls every EUCM distorted, also where it is the plain pinhole.
             is_plain = theirs.is_undistorted() or (name == "EUCM" and not theirs.params[4])
-            if is_pinhole and is_plain:
-                assert list(read_cameras(place)) == ["a"]
-                continue
-            with pytest.raises(ValueError, match=f"a pinhole without lens .*, got {name}; undis"):
-                read_cameras(place)
             if is_pinhole:
                 assert len(read_cameras(place, distortion="ignore")) == 1
+            if (is_pinhole and is_plain) or name in OPENCV_MODELS:
+                assert_maps_as_colmap(read_cameras(place)["a"], theirs)
+                continue
+            with pytest.raises(ValueError, match=f"one of OpenCV's models, got {name}; undis"):
+                read_cameras(place)
         assert int(kind) < 18  # the number of models that are known
 
 

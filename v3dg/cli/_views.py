@@ -43,8 +43,8 @@ class CameraFile:
     cameras: Annotated[Path | None, option("PATH")] = None
     """Use the cameras of this nerfstudio transforms.json, nerfstudio run or COLMAP
     model. `view` offers them together with their photographs."""
-    distortion: Literal["refuse", "ignore"] = "refuse"
-    """Whether lens distortion in that file is an error, or is ignored."""
+    distortion: Literal["draw", "ignore"] = "draw"
+    """Whether pictures have the lens distortion of that file, or it is ignored."""
 
     def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
         """Return the cameras of --cameras; empty without that option. `size` is used if

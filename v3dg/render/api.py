@@ -87,13 +87,13 @@ def render(
     Args:
         subject: What to draw, in world space; or its file, which every call opens
             again.
-        camera: Pinhole camera. With several, each has its own cut and its own picture,
-            as if drawn alone; those of one size and one near plane are drawn at once,
-            unless there is a budget, a cut or a pool (docs/sensors.md). The two eyes of
-            a stereo camera share one cut and one frame. Their two pictures have common
-            statistics, which are sums, except for the number of selected gaussians.
-            None means the first camera of a scene's file, else the camera of
-            `first_camera`.
+        camera: Camera of any model. With several, each has its own cut and its own
+            picture, as if drawn alone; pinholes of one size and one near plane are
+            drawn at once, unless there is a budget, a cut or a pool (docs/sensors.md).
+            The two eyes of a stereo camera share one cut and one frame. Their two
+            pictures have common statistics, which are sums, except for the number of
+            selected gaussians. None means the first camera of a scene's file, else the
+            camera of `first_camera`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.

@@ -271,4 +271,6 @@ def are_alike(cameras: Sequence[Camera]) -> bool:
     size and one near plane."""
     if len(cameras) < 2 or any(type(camera) is not Camera for camera in cameras):
         return False
+    if any(camera.is_distorted for camera in cameras):
+        return False
     return len({form_of(camera) for camera in cameras}) == 1

@@ -15,7 +15,7 @@ from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, check_type, refuse
 from v3dg._urls import beside, is_url
 from v3dg.bundle import Bundle
-from v3dg.cameras import DEFAULT_FOV_X, Axis, Camera, check_cameras
+from v3dg.cameras import DEFAULT_FOV_X, LENS_MODELS, Axis, Camera, LensModel, check_cameras
 from v3dg.io import SUFFIXES
 from v3dg.rotations import normalised, product, similarity_of
 from v3dg.scene import Scene
@@ -185,6 +185,9 @@ def write_scene(
 
 
 def _camera_as_json(name: str, camera: Camera) -> dict[str, object]:
+    lens: dict[str, object] = {}
+    if camera.is_distorted:
+        lens = {"model": camera.model, "distortion": list(camera.distortion)}
     return {
         "name": name,
         "width": camera.width,
@@ -192,6 +195,7 @@ def _camera_as_json(name: str, camera: Camera) -> dict[str, object]:
         "near": camera.near,
         "viewmat": camera.viewmat.tolist(),
         "K": camera.K.tolist(),
+        **lens,
     }
 
 
@@ -361,7 +365,8 @@ def _add_bundles(scene: Scene, instances: Sequence[_Instance]) -> None:
 def _read_cameras(nodes: Node) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
     for node in nodes.items():
-        optional = ("near", "viewmat", "K", "eye", "target", "up", "fov_x")
+        placed = ("eye", "target", "up", "fov_x")
+        optional = ("near", "viewmat", "K", "distortion", "model", *placed)
         fields = node.fields(("name", "width", "height"), optional)
         name = fields["name"].text()
         if name in cameras:
@@ -453,6 +458,20 @@ def _scene_of(instances: list[_Instance]) -> Scene:
     return scene
 
 
+def _read_lens(fields: dict[str, Node]) -> tuple[list[float], LensModel]:
+    """Return the distortion and the model of a camera."""
+    distortion: list[float] = []
+    if "distortion" in fields:
+        distortion = [value.number() for value in fields["distortion"].items()]
+    if "model" not in fields:
+        return distortion, "PINHOLE"
+    name = fields["model"].text()
+    for model in LENS_MODELS:
+        if name == model:
+            return distortion, model
+    raise fields["model"].error(" or ".join(LENS_MODELS))
+
+
 def _read_camera(node: Node, fields: dict[str, Node]) -> Camera:
     width = fields["width"].size()
     height = fields["height"].size()
@@ -463,10 +482,13 @@ def _read_camera(node: Node, fields: dict[str, Node]) -> Camera:
     has_points = "eye" in fields and "target" in fields
     if has_matrices == has_points or (has_matrices and ("up" in fields or "fov_x" in fields)):
         raise node.error("either viewmat and K, or eye and target (optionally with up and fov_x)")
+    if has_points and ("distortion" in fields or "model" in fields):
+        raise node.error("viewmat and K with a model and distortion")
     if has_matrices:
         viewmat = np.array(fields["viewmat"].matrix(4, 4))
         K = np.array(fields["K"].matrix(3, 3))
-        return node.attempt(lambda: Camera(viewmat, K, width, height, near))
+        distortion, model = _read_lens(fields)
+        return node.attempt(lambda: Camera(viewmat, K, width, height, near, distortion, model))
     eye = fields["eye"].vector(3)
     target = fields["target"].vector(3)
     up = [0.0, 0.0, 1.0]

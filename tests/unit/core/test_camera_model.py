@@ -12,8 +12,10 @@ import pytest
 ROOT = Path(__file__).parents[3]
 CSRC = ROOT / "csrc"
 PROGRAM = ROOT / "tests" / "cpp" / "second_camera.cpp"
-# Folders that make pictures of their own, by a pinhole that they choose themselves.
-MAKERS_OF_PINHOLES = {"camera", "fit_group", "levels"}
+# Folders that make pictures of their own, by a pinhole that they choose themselves; the
+# bindings, which make the cameras of users; and projection, whose kernels for pinholes
+# are separate.
+USERS_OF_PINHOLES = {"camera", "fit_group", "levels", "bindings", "project"}
 
 
 def compiler() -> str | None:
@@ -32,12 +34,25 @@ def test_second_camera_model_goes_through_projection(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "")
 
 
+@pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
+def test_distorted_models_agree_with_finite_differences_and_cull_nothing_drawn(
+    tmp_path: Path,
+) -> None:
+    program = tmp_path / "distorted_cameras"
+    source = ROOT / "tests" / "cpp" / "distorted_cameras.cpp"
+    command = [compiler(), "-std=c++20", "-O1", "-I", CSRC, source, "-o", program]
+    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert compiled.returncode == 0, compiled.stderr
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
 def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
-    """All others name the model in use, Intrinsics, so that a second one is a file and
-    its place in camera/camera.h."""
+    """All others name Intrinsics, so that another model is a file and its place in
+    camera/camera.h."""
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
     users = {p.parent.name for p in sources if "Pinhole<" in p.read_text(encoding="utf-8")}
-    assert users == MAKERS_OF_PINHOLES
+    assert users == USERS_OF_PINHOLES
 
 
 def test_fields_of_a_pinhole_are_known_to_its_folder_alone() -> None:
