@@ -107,13 +107,7 @@ def build_bundle(
     check_type("config", config, BuildConfig, "a BuildConfig")
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
-    has_place = executor is None or resume_path is not None
-    check(
-        "resume_path",
-        has_place,
-        "a file on a disk that all workers of the executor share, got None; give the path of the "
-        "bundle",
-    )
+    _check_place(executor, resume_path)
     config = leaves.settings(config)
     quality = chosen_quality(quality, config, leaves, devices[0], free_bytes())
     return build_into(
@@ -127,4 +121,14 @@ def build_bundle(
         quality=quality,
         seen_from=seen_from,
         executor=executor,
+    )
+
+
+def _check_place(executor: Executor | None, resume_path: str | os.PathLike[str] | None) -> None:
+    """Raise ValueError if the workers of an executor have no file for their parts."""
+    check(
+        "resume_path",
+        executor is None or resume_path is not None,
+        "a file on a disk that all workers of the executor share, got None; give the path of the "
+        "bundle",
     )
