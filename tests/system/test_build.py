@@ -142,7 +142,7 @@ def test_largest_seed_is_its_own(asset, device):
     a, b = (build(asset, seed=seed, device=device) for seed in (largest, largest - 1))
     assert not same(a, b)
     for seed in (-1, largest + 1):
-        with pytest.raises(ValueError, match="seed: expected 0 to 2\\^58 - 1"):
+        with pytest.raises(ValueError, match="seed: expected a whole number from 0 to 2\\^58 - 1"):
             build(asset, seed=seed)
 
 
@@ -551,9 +551,8 @@ def test_gaussians_with_wrong_values_are_left_out(asset, name, value, kind, reas
     assert bundle.config["dropped"] == {kind: 2}
     clean = build(asset.subset(np.delete(np.arange(1200), [17, 40])), device=device)
     assert same(bundle, clean)
-    with pytest.raises(
-        ValueError, match=f"asset: expected gaussians that can be drawn, .* {re.escape(reason)}$"
-    ):
+    message = f"asset: expected only gaussians that can be drawn, but .* {re.escape(reason)}; "
+    with pytest.raises(ValueError, match=message):
         build(dirty, device=device, unusable="refuse")
 
 

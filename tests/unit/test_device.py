@@ -57,7 +57,7 @@ def test_auto_is_cuda_where_nothing_is_missing():
 @pytest.mark.gpu
 def test_device_that_is_not_there_is_named():
     count = _core.num_cuda_devices()
-    message = f"device: expected one of {count} CUDA devices, got 'cuda:{count}'"
+    message = f"device: expected the index of one of {count} CUDA devices, got 'cuda:{count}'"
     with pytest.raises(RuntimeError, match=message):
         _device.resolve(f"cuda:{count}")
     with pytest.raises(RuntimeError, match="cuda"):
