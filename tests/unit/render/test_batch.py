@@ -538,7 +538,7 @@ def test_a_subset_moves_on_the_device():
     cameras = cameras_around(3, seed=22)
     batch = v3dg.Renderer(scene, device="cuda").render_batch(cameras)
     assert_same(batch, one_by_one(scene, cameras, "cuda"))
-    with pytest.raises(ValueError, match="ids: expected whole numbers"):
+    with pytest.raises(ValueError, match="ids: expected integers"):
         scene.move(rows.float(), positions=positions)
 
 
