@@ -134,6 +134,7 @@ void* allocate(size_t bytes, cudaStream_t stream) {
 
 void release(void* pointer, int device, cudaStream_t stream) noexcept {
     if (pointer == nullptr) return;
+    const KeepsCaptures keeps_captures;
     int current = device;
     const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
                               cudaSetDevice(device) == cudaSuccess;

@@ -66,6 +66,22 @@ struct PoolBytes {
 };
 PoolBytes pool_bytes();
 
+// While this object exists, calls of this thread that free memory or destroy events do
+// not invalidate a graph that another stream is capturing. An object that is replaced
+// during a capture is destroyed then.
+class KeepsCaptures {
+  public:
+    KeepsCaptures() { exchange(); }
+    ~KeepsCaptures() { exchange(); }
+    KeepsCaptures(const KeepsCaptures&) = delete;
+
+  private:
+    void exchange() noexcept {
+        if (cudaThreadExchangeStreamCaptureMode(&mode_) != cudaSuccess) cudaGetLastError();
+    }
+    cudaStreamCaptureMode mode_ = cudaStreamCaptureModeRelaxed;
+};
+
 bool is_capturing(cudaStream_t stream);
 // Throws std::runtime_error if the stream is being captured. Memory cannot be allocated
 // then, because memory that a graph allocates is freed with the graph.

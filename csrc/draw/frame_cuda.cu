@@ -35,6 +35,7 @@ struct Frame::Slot {
             check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Slot() {
+        const KeepsCaptures keeps_captures;
         // Ignore errors. At exit the driver may be unloaded before this object is
         // destroyed.
         for (const cudaEvent_t event : {begun, prepared, counted, done})
