@@ -481,7 +481,8 @@ class Scene:
             tensor: Array = ids
             kind = str(tensor.dtype)
             fits = tensor.ndim == 1 and kind in ("torch.int32", "torch.int64")
-            check("ids", fits, f"whole numbers (M,), got {kind} of shape {tuple(tensor.shape)}")
+            shape = tuple(tensor.shape)
+            check("ids", fits, f"integers of shape (M,), got {kind} of shape {shape}")
             return tensor
         return self._ids(ids)
 

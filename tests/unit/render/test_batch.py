@@ -1,6 +1,8 @@
 """Batches of cameras: the pictures, the decisions and the counts of each camera alone,
 environments, planes of the caller, and what is refused."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,19 @@ def test_a_list_of_cameras_is_drawn_at_once(scene, device):
     other = Camera.look_at((0, -6, 1), (0, 0, 0), width=20, height=10)
     mixed = v3dg.render(scene, [*cameras, other], device=device)
     assert_same(mixed, one_by_one(scene, [*cameras, other], device))
+
+
+def test_cameras_with_lenses_are_drawn_one_by_one(scene, device):
+    cameras = [
+        dataclasses.replace(camera, distortion=(0.1, 0.01, 0.0, 0.0), model="OPENCV")
+        for camera in v3dg.turntable((0, 0, 0), 6.0, 3, width=WIDTH, height=HEIGHT)
+    ]
+    pictures = v3dg.render(scene, cameras, device=device)
+    assert_same(pictures, one_by_one(scene, cameras, device))
+    pinholes = v3dg.render(scene, [camera.pinhole for camera in cameras], device=device)
+    assert not np.array_equal(host(pictures[0].color), host(pinholes[0].color))
+    with pytest.raises(ValueError, match=r"cameras\[0\]: expected a pinhole"):
+        CameraBatch.of(cameras)
 
 
 @pytest.mark.parametrize("color_by", ["level", "cluster"])
@@ -523,7 +538,7 @@ def test_a_subset_moves_on_the_device():
     cameras = cameras_around(3, seed=22)
     batch = v3dg.Renderer(scene, device="cuda").render_batch(cameras)
     assert_same(batch, one_by_one(scene, cameras, "cuda"))
-    with pytest.raises(ValueError, match="ids: expected whole numbers"):
+    with pytest.raises(ValueError, match="ids: expected integers"):
         scene.move(rows.float(), positions=positions)
 
 
