@@ -54,7 +54,7 @@ def ratios(asset, bundle, width, device):
 
 
 def test_cuts_of_a_faint_asset_keep_its_alpha_and_colour(faint_cloud, device):
-    bundle = v3dg.build_bundle(faint_cloud, device=device, progress=False)
+    bundle = v3dg.build_bundle(faint_cloud, device=device, progress=False, quality="draft")
     for width in (14, 20):
         np.testing.assert_allclose(ratios(faint_cloud, bundle, width, device), 1, atol=0.02)
 
