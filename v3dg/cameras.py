@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._numbers import Floats as Floats
-from v3dg._numbers import check, check_type, one_of, positive, real, refuse, vector, whole
+from v3dg._numbers import check, check_type, floats, one_of, positive, real, refuse, vector, whole
 
 T = TypeVar("T")
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[np.generic]
@@ -235,8 +235,13 @@ class Camera:
         Returns:
             (N, 3) in camera coordinates. The multiple by a depth is the point at that
             depth. NaN where the lens shows nothing.
+
+        Raises:
+            ValueError: The positions are not finite numbers, or have another shape.
         """
-        pixels = np.asarray(positions, np.float64).reshape(-1, 2)
+        pixels = floats(positions, "positions")
+        is_table = pixels.ndim == 2 and pixels.shape[1] == 2
+        check("positions", is_table, f"shape (N, 2), got {pixels.shape}")
         image = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.is_distorted:
             return np.column_stack([image, np.ones(len(image))])

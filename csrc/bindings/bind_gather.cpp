@@ -1,3 +1,5 @@
+// Binds the operations that gather and rotate gaussians to Python.
+
 #include <algorithm>
 #include <functional>
 #include <vector>

@@ -1004,7 +1004,7 @@ def test_tables_of_wrong_kind_are_refused(saved):
     ):
         dataclasses.replace(clusters, offset=clusters.offset.astype(np.int32))
     with pytest.raises(
-        ValueError, match=r"clusters.box: expected float32 \(\d+, 2, 3\), got float32 \(\d+, 6\)"
+        ValueError, match=r"clusters.box: .* shape \(\d+, 2, 3\), got float32 and \(\d+, 6\)"
     ):
         dataclasses.replace(clusters, box=clusters.box.reshape(-1, 6))
     with pytest.raises(ValueError, match=r"groups.ball: expected a C-contiguous array"):

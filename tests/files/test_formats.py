@@ -944,7 +944,7 @@ HOSTILE_HIER = {
     "nothing": (lambda _: b"", "expected a file of at least 4 bytes, got 0"),
     "many gaussians": (
         lambda c: struct.pack("<i", 2**31 - 1) + c[4:],
-        "expected 2147483647 gaussians, got",
+        "bytes for 2147483647 gaussians, got",
     ),
     "cut off": (lambda c: c[:1000], "bytes for 71 gaussians, got a file of 1000 bytes"),
     "many nodes": (

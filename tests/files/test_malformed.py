@@ -293,8 +293,8 @@ def test_changed_bytes_of_json_never_do_worse_than_an_error(tmp_path, reader):
 
 
 JSON_TEXTS = {
-    "a key twice": (b'{"format": 1, "format": 2}', 'the key "format" appears twice'),
-    "a key twice far down": (b'{"a": [{"b": 1, "b": 1}]}', 'the key "b" appears twice'),
+    "a key twice": (b'{"format": 1, "format": 2}', 'the key "format" occurs twice'),
+    "a key twice far down": (b'{"a": [{"b": 1, "b": 1}]}', 'the key "b" occurs twice'),
     "NaN": (b'{"a": NaN}', "NaN is not a JSON number"),
     "-Infinity": (b'{"a": [-Infinity]}', "-Infinity is not a JSON number"),
     "no quotes": (b"{a: 1}", "Expecting property name"),
@@ -350,7 +350,7 @@ SURROGATE = "\ud800"
         ),
         (["a\nb"], 3, '"a\\nb": expected one of format, version, bundles, instances, cameras'),
         (["a" * 99], 3, f'"{"a" * 56}...: expected one of format, version'),
-        (["version"], True, "version: expected 1"),
+        (["version"], True, "version: expected version 1"),
         (["instances", 0, "position", 0], float("1e400"), None),
         (["cameras", 0, "width"], 1e30, "cameras[0].width: expected at most 1048576 px"),
         (["cameras", 0, "width"], -0.0, "cameras[0].width: expected a positive whole number"),

@@ -412,7 +412,9 @@ def test_cameras_are_not_trained():
     *shape, colors, _ = leaves([FIRST])
     places = of_cameras([FIRST])
     places["viewmats"].requires_grad_()
-    with pytest.raises(ValueError, match=r"viewmats: expected no gradient; .* call \.detach\(\)"):
+    with pytest.raises(
+        ValueError, match=r"viewmats: expected tensors without gradient, .* call \.detach\(\)"
+    ):
         rasterization(*shape, colors, **places, sh_degree=3)
 
 

@@ -155,6 +155,21 @@ CALLS = {
         lambda **given: v3dg.Renderer(BUNDLE, device="cpu").render(CAMERA, **given).stats,
         options(fade=1.05, background=(0, 0, 0), min_transmittance=0.001),
     ),
+    "Renderer.render_batch": (
+        lambda **given: v3dg.Renderer(BUNDLE, device="cpu").render_batch([CAMERA], **given).stats,
+        {
+            "tolerance": 1.0,
+            "min_level": 0,
+            "fade": 1.05,
+            "background": (0, 0, 0),
+            "min_transmittance": 0.001,
+        },
+    ),
+    "Camera.directions": (CAMERA.directions, {"positions": [[1, 2], [3, 4]]}),
+    "Scene.set_environment": (
+        lambda **given: v3dg.Scene.of(BUNDLE).set_environment(**given),
+        {"environment": 2, "ids": [0]},
+    ),
     "Renderer.settle": (
         lambda **given: v3dg.Renderer(BUNDLE, device="cpu", memory="64MB").settle(CAMERA, **given),
         options(fade=1.05, timeout=30.0),

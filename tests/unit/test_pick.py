@@ -73,5 +73,5 @@ def test_pick_takes_the_one_in_front():
     assert found.instance == 1
     assert abs(found.position[1] - 1) < 1.5
     assert v3dg.pick(scene, camera, 0, 0) is None
-    with pytest.raises(ValueError, match=r"x, y: expected a pixel of 64 x 64, got \(64, 0\)"):
+    with pytest.raises(ValueError, match=r"x, y: expected a pixel inside 64 x 64, got \(64, 0\)"):
         v3dg.pick(scene, camera, 64, 0)

@@ -328,13 +328,7 @@ def _build(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> JsonObject:
     """Build and write one bundle; return its description as a JSON object."""
-    for path in paths:
-        _common.require_file(path, *SUFFIXES)
-    advice = ""
-    if output.is_dir():
-        advice = f", got a folder; {output / subject_name(paths[0])}.v3dg would be a file in it"
-    check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
-    _common.check_output(output, *paths)
+    _check_files(paths, output)
     start = time.perf_counter()
     with _resume_advised(output):
         bundle, is_built = _build_file(options, paths, output, executor)
@@ -367,6 +361,17 @@ def _build(
         "seconds": seconds,
         "notes": notes,
     }
+
+
+def _check_files(paths: Sequence[Path], output: Path) -> None:
+    """Raise an error unless the assets can be read and the bundle can be written."""
+    for path in paths:
+        _common.require_file(path, *SUFFIXES)
+    advice = ""
+    if output.is_dir():
+        advice = f", got a folder; {output / subject_name(paths[0])}.v3dg would be a file in it"
+    check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
+    _common.check_output(output, *paths)
 
 
 def _sample_of(bundle: Bundle) -> Gaussians:

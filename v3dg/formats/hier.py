@@ -40,17 +40,10 @@ def open_file(path: AnyPath) -> AssetFile:
     dtypes = [np.dtype(("<f4", _WIDTHS[0])), *(np.dtype((kind, width)) for width in _WIDTHS[1:])]
     column_starts = 4 + np.cumsum([0, *(count * dtype.itemsize for dtype in dtypes)])
     columns_end = int(column_starts[-1])
-    least_bytes = columns_end + 4
-    expected = f"at least {least_bytes} bytes for {count} gaussians"
-    damaged = f"got a file of {file.num_bytes} bytes; the file is damaged, or no .hier file"
-    check(path, least_bytes <= file.num_bytes, f"{expected}, {damaged}")
-    num_nodes = int(file.rows(_INT, columns_end, 1)[0])
-    # The size includes the box of the node, which is not read.
+    # The size of a node includes its box, which is not read.
     node_bytes = node.itemsize + 8 * np.dtype(kind).itemsize
-    num_bytes = least_bytes + num_nodes * node_bytes
-    expected = f"{num_bytes} bytes for {count} gaussians and {num_nodes} nodes"
-    check(path, num_bytes == file.num_bytes, f"{expected}, {damaged}")
-    leaves = _leaves(path, file.rows(node, least_bytes, num_nodes), count)
+    num_nodes = _num_nodes(file, count, columns_end, node_bytes)
+    leaves = _leaves(path, file.rows(node, columns_end + 4, num_nodes), count)
 
     def read(first: int, last: int) -> Gaussians:
         rows = leaves[first:last]
@@ -76,6 +69,20 @@ def open_file(path: AnyPath) -> AssetFile:
         return assemble(len(rows), 3, decode)
 
     return AssetFile(path, len(leaves), 3, read)
+
+
+def _num_nodes(file: File, count: int, columns_end: int, node_bytes: int) -> int:
+    """Return the number of nodes, which follows the columns of the gaussians; raise
+    ValueError unless the file has the size that both numbers imply."""
+    damaged = f"got a file of {file.num_bytes} bytes; the file is damaged, or no .hier file"
+    least_bytes = columns_end + 4
+    expected = f"at least {least_bytes} bytes for {count} gaussians"
+    check(file.path, least_bytes <= file.num_bytes, f"{expected}, {damaged}")
+    num_nodes = int(file.rows(_INT, columns_end, 1)[0])
+    num_bytes = least_bytes + num_nodes * node_bytes
+    expected = f"{num_bytes} bytes for {count} gaussians and {num_nodes} nodes"
+    check(file.path, num_bytes == file.num_bytes, f"{expected}, {damaged}")
+    return num_nodes
 
 
 def _leaves(path: AnyPath, nodes: NDArray[np.void], count: int) -> NDArray[np.int64]:

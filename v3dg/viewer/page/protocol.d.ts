@@ -46,8 +46,8 @@ export interface Failed {
  *
  * Attributes:
  *     gaussians_selected, gaussians_in_frustum, tolerance, select_ms, draw_ms, levels,
- *         missing: See `v3dg.Stats`. memory_bytes: Memory of the viewer's process in
- *         bytes.
+ *         missing: See `v3dg.Stats`.
+ *     memory_bytes: Memory of the viewer's process in bytes.
  */
 export interface Figures {
   gaussians_selected: number;
