@@ -69,6 +69,7 @@ def rasterize(
     background_color = color(background, "background")
     if antialiased is None:
         antialiased = bool(getattr(gaussians, "antialiased", None))
+    check_type("antialiased", antialiased, bool, "True, False or None")
     means = gaussians.means
     if isinstance(means, np.ndarray):
         drawn = _core.rasterize(

@@ -469,7 +469,7 @@ def test_a_server_of_another_kind_is_no_scheduler(tmp_path, answer):
     with serving(answer) as address:
         expected = (
             f"{address}: expected a dask scheduler, got a server that speaks another protocol; "
-            "give the"
+            "pass the"
         )
         fails(1, expected, "build", "a.ply", "--scheduler", address, cwd=tmp_path)
 

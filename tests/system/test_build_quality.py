@@ -360,7 +360,7 @@ def test_the_command_builds_each_quality(short, file, tmp_path, capsys):
         assert ("refined" in v3dg.Bundle.open(output).config) == (quality == "standard")
         assert len(advice) == (quality is None)
         if advice:
-            assert re.search(r"in about \d+ (s|minutes|hours) on this CPU", advice[0])
+            assert re.search(r"takes about \d+ (s|minutes|hours) on this CPU", advice[0])
             words = shlex.split(advice[0].split("`")[1])
             refined = str(tmp_path / "a scene_refined.v3dg")
             assert words == ["v3dg", "refine", str(output), refined, "--steps", str(STEPS)]

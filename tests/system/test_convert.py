@@ -186,7 +186,7 @@ def test_what_cannot_be_meant_is_refused(folder):
     )
     fails(
         2,
-        "--views: expected one camera",
+        "--views: expected exactly one camera",
         "convert",
         "tuft.v3dg",
         "x.ply",

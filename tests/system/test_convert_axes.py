@@ -192,7 +192,7 @@ def test_wrong_values_are_left_out_refused_or_kept_and_that_is_said(folder, asse
     )
     fails(
         1,
-        f"bad.ply: {text}, which x.glb cannot hold; {advice}",
+        f"bad.ply: {text}, which x.glb cannot store; {advice}",
         "convert",
         "bad.ply",
         "x.glb",

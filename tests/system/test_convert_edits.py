@@ -111,7 +111,7 @@ def test_edits_apply_to_a_level_and_to_a_cut(folder):
         (2, "--crop: expected box:", ["--crop", "box:0,0,nan,1,1,1"]),
         (2, "--crop: expected the smaller value of each", ["--crop", "box:1,0,0,0,1,1"]),
         (2, "--delete: expected a finite centre", ["--delete", "sphere:0,0,0,-1"]),
-        (2, "--min-opacity: expected 0 to 1, got 2", ["--min-opacity", "2"]),
+        (2, "--min-opacity: expected a number from 0 to 1, got 2", ["--min-opacity", "2"]),
         (2, "--degree: expected one of 0, 1, 2, 3", ["--degree", "4"]),
         (2, "--add: expected FILE@X,Y,Z", ["--add", "tuft.ply@1,2"]),
         (2, "--add: expected a finite position and a positive", ["--add", "tuft.ply@1,2,3,0"]),
