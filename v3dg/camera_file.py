@@ -7,7 +7,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -24,6 +24,7 @@ from v3dg.cameras import (
     Camera,
     Floats,
     LensModel,
+    by_term,
     check_cameras,
     intrinsics,
     is_rotation,
@@ -387,16 +388,11 @@ def _lens_as_json(camera: Camera) -> dict[str, object]:
     if not camera.is_distorted:
         return {}
     if camera.model == "OPENCV_FISHEYE":
-        return {"camera_model": camera.model, **_by_term(FISHEYE_TERMS, camera.distortion)}
-    coefficients = _by_term(OPENCV_TERMS, camera.distortion)
+        return {"camera_model": camera.model, **by_term(FISHEYE_TERMS, camera.distortion)}
+    coefficients = by_term(OPENCV_TERMS, camera.distortion)
     if any(coefficients[term] for term in ("k4", "k5", "k6")):
         return {"camera_model": "FULL_OPENCV", **coefficients}
     return {"camera_model": "OPENCV", **{term: coefficients[term] for term in _PINHOLE_TERMS}}
-
-
-def _by_term(terms: Sequence[str], coefficients: Sequence[float]) -> dict[str, float]:
-    """Return coefficients by their names; those that are left out are 0."""
-    return {**dict.fromkeys(terms, 0.0), **dict(zip(terms, coefficients, strict=False))}
 
 
 def _lens(fields: Mapping[str, Node], distortion: str) -> tuple[LensModel, tuple[float, ...]]:

@@ -25,6 +25,8 @@ LENS_MODELS: tuple[LensModel, ...] = get_args(LensModel)
 # The coefficients of a distortion, in order.
 OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
+# The order in which the core takes the coefficients of OPENCV.
+_CORE_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 # Numbers of coefficients that each model may have.
 _NUM_COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
     "PINHOLE": (0,),
@@ -212,8 +214,8 @@ class Camera:
         if self.model == "OPENCV_FISHEYE":
             return make(model="fisheye", distortion=list(self.distortion))
         if self.is_distorted:
-            k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, 0.0, 0.0, 0.0, 0.0)[:8]
-            return make(model="opencv", distortion=[k1, k2, k3, k4, k5, k6, p1, p2])
+            terms = by_term(OPENCV_TERMS, self.distortion)
+            return make(model="opencv", distortion=[terms[name] for name in _CORE_TERMS])
         return make()
 
     @property
@@ -489,6 +491,12 @@ def _coefficients(distortion: Sequence[float], model: LensModel) -> tuple[float,
     return values
 
 
+def by_term(terms: Sequence[str], coefficients: Sequence[float]) -> dict[str, float]:
+    """Return the coefficients of a lens by their names; those that are left out are
+    0."""
+    return {**dict.fromkeys(terms, 0.0), **dict(zip(terms, coefficients, strict=False))}
+
+
 def _first_reaching(radius: Floats, end: float, function: Callable[[Floats], Floats]) -> Floats:
     """Return where an increasing function has a value, by bisection from 0 to ``end``;
     NaN where it is smaller everywhere."""
@@ -519,11 +527,13 @@ def _fisheye_directions(image: Floats, coefficients: Sequence[float], end: float
 def _opencv_directions(image: Floats, coefficients: Sequence[float], end: float) -> Floats:
     """Return (x / z, y / z, 1); ``image`` is in units of the focal lengths. The radial
     distortion is inverted by bisection, and the tangential one by iteration."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    terms = by_term(OPENCV_TERMS, coefficients)
+    p1 = terms["p1"]
+    p2 = terms["p2"]
 
     def radial_factor(square: Floats) -> Floats:
-        numerator = np.polyval([k3, k2, k1, 1.0], square)
-        return numerator / np.polyval([k6, k5, k4, 1.0], square)
+        numerator = np.polyval([terms["k3"], terms["k2"], terms["k1"], 1.0], square)
+        return numerator / np.polyval([terms["k6"], terms["k5"], terms["k4"], 1.0], square)
 
     slopes = np.zeros_like(image)
     for _ in range(40):

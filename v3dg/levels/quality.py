@@ -13,7 +13,7 @@ from v3dg._numbers import check, one_of
 from v3dg._progress import Progress
 from v3dg.bundle import Bundle
 from v3dg.gaussians import gaussian_bytes
-from v3dg.levels.refined import DROP, Cuts, default_steps, refined_bundle, request_of
+from v3dg.levels.refined import DROP, Cuts, default_steps, record_of, refined_bundle
 from v3dg.levels.viewpoints import RECORDED, SeenFrom
 
 Quality = Literal["draft", "standard", "best"]
@@ -57,8 +57,7 @@ class Refinement:
         refined. The eyes, which follow from its gaussians, are those that it has."""
         if bundle.num_levels < 2:
             return settings
-        record: JsonObject = {"steps": self.steps, "drop": DROP, "seed": self.seed}
-        record |= request_of(self.seen_from)
+        record = record_of(self.steps, DROP, self.seed, self.seen_from)
         record_of_bundle = bundle.config.get("refined")
         if isinstance(record_of_bundle, dict):
             record |= {n: record_of_bundle[n] for n in RECORDED if n in record_of_bundle}

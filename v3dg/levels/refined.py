@@ -52,14 +52,14 @@ def refined_bundle(
     """Return a copy of a bundle with refined levels; see `v3dg.refine_bundle`."""
     if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
-    record: JsonObject = {"steps": steps, "drop": drop, "seed": seed}
+    record = record_of(steps, drop, seed, seen_from)
     text = ""
     if cameras:
         record["cameras"] = len(cameras)
     else:
         viewpoints = viewpoints_of(bundle, seen_from)
         cameras = viewpoints.cameras
-        record |= request_of(seen_from) | viewpoints.record
+        record |= viewpoints.record
         text = viewpoints.text
     if drop > 0:
         bundle = without_unseen(bundle, cameras, drop, seed, device, progress)
@@ -70,11 +70,12 @@ def refined_bundle(
     return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
 
 
-def request_of(seen_from: SeenFrom) -> JsonObject:
-    """Return the entry about from where a user has said that a bundle is seen."""
-    if seen_from == "auto":
-        return {}
-    return {"seen_from": seen_from}
+def record_of(steps: int, drop: float, seed: int, seen_from: SeenFrom) -> JsonObject:
+    """Return what the config of a bundle says of the request for its refinement."""
+    record: JsonObject = {"steps": steps, "drop": drop, "seed": seed}
+    if seen_from != "auto":
+        record["seen_from"] = seen_from
+    return record
 
 
 def without_unseen(
