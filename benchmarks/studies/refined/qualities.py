@@ -25,7 +25,6 @@ from typing import Annotated, Literal
 import tyro
 
 import v3dg
-from benchmarks.evaluation import record
 from benchmarks.studies.pairs.measure import errors
 from benchmarks.studies.refined import steps
 from benchmarks.studies.refined.worlds import count_at
@@ -64,23 +63,6 @@ class Config:
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
 
 
-class Results:
-    """Rows that are written as soon as they are known."""
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._start = time.perf_counter()
-        self._rows: list[Row] = []
-
-    def is_over(self) -> bool:
-        return time.perf_counter() - self._start > self._config.seconds
-
-    def add(self, row: Row) -> None:
-        self._rows.append(row)
-        print(row, flush=True)
-        record.write(self._config.output, {"rows": self._rows}, self._config.device)
-
-
 def qualities_of(config: Config, asset: v3dg.Gaussians) -> list[Quality]:
     if len(asset) > config.most_for_best:
         return ["draft", "standard"]
@@ -97,7 +79,12 @@ def built(
 
 
 def measured(
-    config: Config, name: str, asset: v3dg.Gaussians, folder: Path, judges: Judges, results: Results
+    config: Config,
+    name: str,
+    asset: v3dg.Gaussians,
+    folder: Path,
+    judges: Judges,
+    results: steps.Results,
 ) -> dict[Quality, v3dg.Bundle]:
     """Add the rows of one asset; return its bundles by quality."""
     of_steps = steps.Config(config.donut, views=1, device=config.device)
@@ -182,7 +169,7 @@ def frame_times(config: Config, layout: Path, bundle: v3dg.Bundle) -> Iterator[R
 
 
 def measure(config: Config, folder: Path, judges: Judges) -> None:
-    results = Results(config)
+    results = steps.Results(config.output, config.device, config.seconds, {})
     donut = v3dg.read_asset(config.donut)
     built(config, donut, None)  # loads kernels
     bundles = measured(config, "donut", donut, folder, judges, results)

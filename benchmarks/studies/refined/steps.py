@@ -250,30 +250,34 @@ def compared(flips: list[float], built: list[float]) -> Row:
 
 
 class Results:
-    """Writes all rows to the file again whenever a row is added."""
+    """Writes all rows to a file again whenever a row is added, with the settings of the
+    study and the time that it has taken."""
 
-    def __init__(self, config: Config) -> None:
-        self._config = config
+    def __init__(self, output: str | None, device: str, most_seconds: float, about: Row) -> None:
+        self._output = output
+        self._device = device
+        self._most_seconds = most_seconds
+        self._about = about
         self._start = time.perf_counter()
         self._rows: list[Row] = []
 
     def is_over(self) -> bool:
-        return time.perf_counter() - self._start > self._config.seconds
+        """Return whether the time is over in which a measurement may begin."""
+        return self._seconds() > self._most_seconds
 
     def add(self, row: Row) -> None:
         self._rows.append(row)
         print(row, flush=True)
-        settings: Row = {
-            "pictures": self._config.pictures,
-            "percents": _PERCENTS,
-            "factors": _FACTORS,
-        }
-        settings["seconds"] = round(time.perf_counter() - self._start, 1)
-        record.write(self._config.output, settings | {"rows": self._rows}, self._config.device)
+        settings = self._about | {"seconds": round(self._seconds(), 1)}
+        record.write(self._output, settings | {"rows": self._rows}, self._device)
+
+    def _seconds(self) -> float:
+        return time.perf_counter() - self._start
 
 
 def measure(config: Config, folder: Path, judges: Judges) -> None:
-    results = Results(config)
+    settings: Row = {"pictures": config.pictures, "percents": _PERCENTS, "factors": _FACTORS}
+    results = Results(config.output, config.device, config.seconds, settings)
     donut = v3dg.read_asset(config.donut)
     assets = {"donut": donut, "heap": heap_of(donut)}
     studies = [Study(config, name, assets[name], folder) for name in config.assets]
