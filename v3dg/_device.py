@@ -77,7 +77,7 @@ def resolve(device: str | Device) -> Device:
             return Device(int(number))
         return Device(int(torch.cuda.current_device()))
     if kind == "cuda":
-        raise RuntimeError(f"device: {missing}; or use 'cpu'")
+        raise RuntimeError(f"device: {missing}, or use 'cpu'")
     return CPU
 
 

@@ -17,7 +17,7 @@ from v3dg import _core, _device
 from v3dg._device import CPU, Device
 
 BUILT_WITHOUT = "v3dg was built without CUDA; install it again where nvcc is found"
-NO_DEVICE = "expected a CUDA device and its driver, got none"
+NO_DEVICE = "expected a CUDA device and its driver, got none; install the driver"
 
 
 def test_arrays_go_to_a_device_and_back(device):
@@ -41,7 +41,7 @@ def test_auto_is_the_cpu_where_cuda_is_missing(monkeypatch):
     assert _device.resolve("cpu") == _device.resolve(CPU) == CPU
     monkeypatch.setattr(_device, "missing_for_cuda", lambda: "something")
     assert _device.resolve("auto") == CPU
-    with pytest.raises(RuntimeError, match="device: something; or use 'cpu'"):
+    with pytest.raises(RuntimeError, match="device: something, or use 'cpu'"):
         _device.resolve("cuda")
 
 
@@ -82,7 +82,7 @@ def test_device_of_a_tensor_is_where_it_is():
 @pytest.mark.skipif(_core.num_cuda_devices() > 0, reason="there is a CUDA device")
 def test_missing_device_is_named():
     expected = NO_DEVICE if _core.has_cuda else BUILT_WITHOUT
-    with pytest.raises(RuntimeError, match=f"device: {expected}; or use 'cpu'"):
+    with pytest.raises(RuntimeError, match=f"device: {expected}, or use 'cpu'"):
         _device.resolve("cuda")
 
 
@@ -104,7 +104,7 @@ def test_missing_torch_is_named(tmp_path):
     assert run.stdout == "cpu\n"
     assert run.stderr.splitlines()[-1] == (
         "RuntimeError: device: CUDA and gradients: expected torch>=2.2, got no package or an "
-        "older version; run pip install 'torch>=2.2'; or use 'cpu'"
+        "older version; run pip install 'torch>=2.2', or use 'cpu'"
     )
 
 
