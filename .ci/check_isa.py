@@ -64,7 +64,7 @@ def main(path: str) -> int:
         )
         return 1
     dispatched = sum(function.is_dispatched for function in functions.values())
-    # Functions to which no instruction refers are called through tables or from outside.
+    # Functions that no instruction refers to are called through tables or from outside.
     called = {t for address, f in functions.items() for t in f.targets if t != address}
     todo = [
         address for address, f in functions.items() if address not in called and not f.is_dispatched
