@@ -18,7 +18,7 @@ SOON_SECONDS = 300
 
 
 def durations_of(path: Path) -> dict[str, float]:
-    """Return the duration of each test in seconds, by the module and name of the test."""
+    """Return the duration of each test in seconds, by its module and name."""
     durations: dict[str, float] = {}
     for case in ElementTree.parse(path).iter("testcase"):
         name = f"{case.get('classname')}::{case.get('name')}"
