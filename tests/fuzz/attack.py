@@ -22,7 +22,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from fuzz.attacks.pool import attack
 
-# Shares of the time when all are run: what finds most in a second needs least of it.
+# Shares of the time if all kinds run. Kinds that find most per second need the least
+# time.
 KINDS = {
     "files": 0.3,
     "commands": 0.15,
