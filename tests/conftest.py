@@ -1,17 +1,17 @@
 """Fixtures and settings of all tests: both devices, Chromium, and a small bundle for
 the viewer.
 
-Tests stand in the folder of their kind:
+Each test is in the folder of its kind:
 
-    unit     one module or operation in this process; named after what it tests
-    files    formats and places of files: reading, writing, and what is refused
-    system   commands, servers, pools, threads and builds at work as a whole
+    unit     one module or operation in this process; files have the names of modules
+    files    file formats and places of files: reading, writing, and refused files
+    system   whole commands, servers, pools, threads and builds
     browser  pages in Chromium
     attack   hostile input, and programs that are stopped at any moment
-    docs     the tree, the types and the pages say what is true
+    docs     the source tree, the types and the pages are correct
 
-Those of `system`, `browser` and `attack` are slow: `pytest -m "not slow"` leaves them
-out, and with them single tests elsewhere that take more than a few seconds.
+Tests in `system`, `browser` and `attack` are marked slow, and so are tests elsewhere
+that take more than a few seconds. `pytest -m "not slow"` leaves them out.
 """
 
 import gc

@@ -152,7 +152,7 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
     selected = tab.figure("selected")
     tab.set("Tolerance px²", 32)
     coarse = tab.settled()
-    # near the asset, most of the picture is fine detail
+    # Near the asset, most of the picture is fine detail.
     assert tab.figure("selected") < 0.9 * selected
     assert differ(turned, coarse) > 0.001
 
@@ -554,7 +554,7 @@ def test_dropped_file_is_shown(tab, tmp_path):
     tab.page.wait_for_timeout(900)  # waits until the camera has arrived
     assert tab.settled().max() > 60
     assert tab.figure("selected") == 300
-    # the share of the window that a first view fills
+    # A first view fills this share of the window.
     assert tab.figure("in the frustum") >= 0.96 * 300
 
 

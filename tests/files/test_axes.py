@@ -67,7 +67,7 @@ def test_all_axes_are_turned_to_and_mirrored(asset, axes):
     np.testing.assert_allclose(back.sh, asset.sh, atol=1e-5)
 
 
-# half a turn, a reflection, a quarter of a turn
+# Half a turn, a reflection, and a quarter of a turn.
 @pytest.mark.parametrize("axes", ["RUB", "LDF", "RFU"])
 @pytest.mark.parametrize("antialiased", [True, False, None])
 def test_turns_keep_antialiasing(asset, axes, antialiased):

@@ -543,7 +543,7 @@ def test_hostile_spz_is_refused(tmp_path, case):
 
 
 def assert_refused_cheaply(path, message):
-    # modules that are imported late are imported here
+    # Modules that are imported late are imported here.
     with pytest.raises(ValueError, match=f"^{path}: "):
         read_asset(path)
     tracemalloc.start()
@@ -1027,7 +1027,7 @@ def gsplat_tensors(asset):
 def assert_same(gaussians, asset):
     for name in ("means", "sh"):
         np.testing.assert_array_equal(getattr(gaussians, name), getattr(asset, name))
-    # of the logarithm in float32
+    # The bound is that of the logarithm in float32.
     np.testing.assert_allclose(gaussians.scales, asset.scales, rtol=8e-7)
     np.testing.assert_allclose(gaussians.opacities, asset.opacities, atol=1e-6)
     np.testing.assert_allclose(gaussians.quats, unit(asset.quats), atol=2e-7)

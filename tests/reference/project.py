@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# of half the field of view: beyond it the Jacobian no longer follows the mean
+# This is a share of half the field of view. Beyond it the Jacobian no longer follows
+# the mean.
 FIELD_OF_VIEW_MARGIN = 0.3
 
 

@@ -301,8 +301,8 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
             build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
         except ValueError as error:
             refused.append(str(error))
-        # one that makes a level look truncated, or is at the place of the header and
-        # the tables
+        # This size makes a level look truncated, or is at the place of the header and
+        # the tables.
         else:
             assert checkpoint.read_bytes() == expected, damage
     assert len(refused) > len(damaged) / 2

@@ -96,7 +96,7 @@ def test_blender_camera_looks_along_minus_z():
     np.testing.assert_allclose(camera.position, (1, 2, 3))
     uv, depth = pixel(camera, (1, 2, 1))
     np.testing.assert_allclose((*uv, depth), (100, 50, 2))
-    # y is up in Blender
+    # In Blender, y of a camera points up.
     np.testing.assert_allclose(pixel(camera, (1, 3, 1))[0], [100, 0], atol=1e-9)
     assert camera.fy == camera.fx
     two_fields = Camera.from_blender(matrix, math.pi / 2, 200, 100, fov_y=math.pi / 2)

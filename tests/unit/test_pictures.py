@@ -61,7 +61,7 @@ def test_a_contact_sheet_has_each_picture_below_its_text():
     assert (sheet == (255, 0, 0)).all(axis=2).sum() == red[..., 0].size
     assert (sheet == (0, 0, 255)).all(axis=2).sum() == 2 * blue[..., 0].size
     rows = np.flatnonzero((sheet == (0, 0, 255)).all(axis=2).any(axis=1))
-    # the second row begins below the highest picture of the first row
+    # The second row begins below the highest picture of the first row.
     assert rows[9] - rows[0] > 30
 
 

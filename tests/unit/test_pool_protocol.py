@@ -1,16 +1,16 @@
-"""A model of how a pool settles, of which all interleavings are tried.
+"""A model of how a pool settles. All interleavings of its threads are tried.
 
-The threads of a pool (csrc/residency/pool_shared.h) are three here: one that settles a
-view and then draws it, the one that decides, and one that reads. A step is what a
-thread does while it holds the lock, or what it does without it; any thread that can
-take a step may take the next one. The view needs a page and, below it, another one,
-which its cut asks for only once the first is in the page table of its frame. An earlier
-frame, of another view, may have left needs that are not decided about; deciding about
-them may bring a page of its own, and may raise the tolerance.
+The model has three threads of a pool (csrc/residency/pool_shared.h): one settles a view
+and then draws it, one decides, and one reads. A step is what a thread does while it
+holds the lock, or what it does without the lock. Any thread that can do a step may do
+the next one. The view needs a page, and another page below it, which its cut requests
+only once the first page is in the page table of its frame. An earlier frame with
+another view may have left needs about which the pool has not decided yet. That decision
+may load another page, and may raise the tolerance.
 
-`RULES` are what the pool does so that a settled view is drawn complete. Without any one
-of them the model finds an interleaving that draws a picture with a page missing or at a
-raised tolerance.
+`RULES` are the rules by which the pool draws settled views completely. Without any one
+of them, the model finds an interleaving that draws a picture with a missing page or at
+a raised tolerance.
 """
 
 from dataclasses import dataclass, replace

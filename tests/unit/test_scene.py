@@ -57,7 +57,7 @@ def test_rotations_are_rotations(quaternion):
     rotation = scene.rotations[0]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) > 0
-    # the point that the rotation leaves in place
+    # The rotation leaves this axis in place.
     axis = np.array(quaternion[1:]) / max(map(abs, quaternion))
     np.testing.assert_allclose(rotation @ axis, axis, atol=1e-12)
 

@@ -133,7 +133,7 @@ kept = []
 
 
 def go_on(name, has_begun=None):
-    # nothing can be loaded any more once the interpreter ends
+    # Once the interpreter ends, nothing can be loaded any more.
     with contextlib.suppress(ImportError):
         for done in WORK[name]():
             kept[1:] = [done]

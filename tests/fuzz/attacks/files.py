@@ -30,7 +30,8 @@ LIMIT_S = 60  # longer is a hang
 # The bounds in docs/robustness.md on memory beyond what was used before: MB, bytes per
 # byte on disk, per gaussian and per byte of JSON, and per pixel of a compared picture.
 MOST_MB, A_BYTE, A_GAUSSIAN, A_BYTE_OF_JSON, A_PIXEL = 100, 8, 400, 40, 250
-# gaussians of a file of any size; larger files may have one for each of their bytes
+# The number of gaussians in a file of any size. Larger files may have one for each of
+# their bytes.
 BELIEVED = 1 << 18
 # Seconds on one core, which other work on the machine slows down, and seconds per
 # million bytes and per million gaussians.

@@ -462,7 +462,7 @@ def test_scratch_in_use_and_files_of_others_are_kept(tmp_path, small):
     ):
         pass
     assert (tmp_path / "s" / "letter").read_text() == "dear"
-    # a name that scratch files have, too
+    # Scratch files have such a name, too.
     (tmp_path / "s" / "letter").rename(tmp_path / "s" / "order")
     with (
         pytest.raises(
