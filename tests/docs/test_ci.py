@@ -1,4 +1,4 @@
-"""The steps of .ci/run, the jobs that name them, and the summary of durations."""
+"""The steps of .ci/run, the jobs that use them, and the summary of durations."""
 
 import re
 import subprocess
