@@ -255,8 +255,9 @@ void clip_pairs(const HostScene& scene, const Camera& camera, const GivenCut& gi
     mark_clipped(CutDraws(scene, camera, given).draws(), camera.pinhole(), window, clipped, stop);
 }
 
-// Sets the channel `clipped` of a picture whose cut has this tolerance. A cut leaves out
-// clusters before the near plane and beside the frustum, so the whole cut is selected.
+// Sets the channel `clipped` of a picture whose cut has this tolerance. A cut leaves
+// out clusters before the near plane and beside the frustum, so the whole cut is
+// selected.
 void clip_selected(const HostScene& scene, const Camera& camera, SelectRule rule,
                    float tolerance_px2, const Window& window, uint8_t* clipped,
                    const std::atomic<bool>* stop) {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from v3dg import _core, _device
+from v3dg import _core
 from v3dg._numbers import MOST_FLOAT, check, check_type, one_of
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from v3dg._device import HostArray
     from v3dg.gaussians import Array
 
 Channel: TypeAlias = Literal[
@@ -34,8 +35,8 @@ class MeshLayer:
     """The z-buffer of a picture of meshes, from any renderer, for the same camera:
     gaussians behind the meshes are hidden, and those in front are blended over them.
 
-    The planes are (H, W) for one camera, or (B, H, W) for a batch; NumPy arrays or
-    other arrays on the host.
+    The planes are (H, W) for one camera, or (B, H, W) for a batch: arrays, or torch
+    tensors, which are copied to the host.
 
     Attributes:
         color: (..., 3) colour of the meshes, not multiplied by coverage.
@@ -102,11 +103,25 @@ class MeshLayer:
         return np.ascontiguousarray(normal / np.where(length > 0, length, 1), np.float32)
 
 
+def _array(values: Array, name: str) -> HostArray:
+    """Return an array or a tensor as a NumPy array; raise ValueError for others."""
+    array: HostArray
+    try:
+        if hasattr(values, "detach"):
+            array = values.numpy(force=True)
+        else:
+            array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError, AttributeError):
+        kind = type(values).__name__
+        raise ValueError(f"mesh.{name}: expected an array of numbers, got {kind}") from None
+    return array
+
+
 def _numbers(
     values: Array, name: str, shape: tuple[int, ...] | None = None
 ) -> npt.NDArray[np.float32]:
     """Return a plane as float32; raise ValueError for NaN or another shape."""
-    array = np.asarray(_device.to_host(values))
+    array = _array(values, name)
     check(f"mesh.{name}", array.dtype.kind in "biuf", f"an array of numbers, got {array.dtype}")
     fits = shape is None or array.shape == shape
     check(f"mesh.{name}", fits, f"shape {shape}, got {array.shape}")
@@ -120,7 +135,7 @@ def _ids(values: Array | None, name: str, shape: tuple[int, ...]) -> npt.NDArray
     """Return a plane of ids as int32; raise ValueError for other kinds and shapes."""
     if values is None:
         return None
-    array = np.asarray(_device.to_host(values))
+    array = _array(values, name)
     fits = array.dtype.kind in "iu" and array.shape == shape
     expected = f"whole numbers of shape {shape}"
     check(f"mesh.{name}", fits, f"{expected}, got {array.dtype} of shape {array.shape}")
@@ -152,7 +167,7 @@ def sensor_of(
         ValueError: A channel is unknown, a plane of the mesh is invalid, or there is a
             mesh for a list of cameras.
     """
-    if not channels and mesh is None and isinstance(channels, tuple):
+    if isinstance(channels, tuple) and not channels and mesh is None:
         return bool(depth), None  # fast path for most pictures
     if not isinstance(channels, list | tuple | set | frozenset):
         kind = type(channels).__name__
