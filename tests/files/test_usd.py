@@ -47,6 +47,19 @@ def test_an_asset_reads_back(tmp_path, suffix, degree):
         assert (tmp_path / "a.usda").read_text().startswith("#usda 1.0")
 
 
+@pytest.mark.parametrize("degree", range(4))
+def test_coefficients_say_how_many_belong_to_a_gaussian(tmp_path, degree):
+    """Requirement VG.035 of NVIDIA's usd-validation: interpolation `vertex`, and an
+    elementSize of the degree's number of coefficients."""
+    path = tmp_path / "a.usdc"
+    v3dg.write_asset(path, random_gaussians(np.random.default_rng(0), 5, degree))
+    stage = Usd.Stage.Open(os.fspath(path))
+    prim = stage.GetDefaultPrim()
+    harmonics = UsdGeom.Primvar(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients"))
+    assert harmonics.GetInterpolation() == "vertex"
+    assert harmonics.GetElementSize() == (degree + 1) ** 2
+
+
 def test_no_gaussians_are_written(tmp_path):
     v3dg.write_asset(tmp_path / "a.usdc", random_gaussians(np.random.default_rng(0), 0, 1))
     assert len(v3dg.read_asset(tmp_path / "a.usdc")) == 0
