@@ -4,10 +4,12 @@ test_blender.py with a Python that has bpy, in a folder of its own.
 Prints the name of each function and why it failed, or "", as JSON.
 """
 
+import importlib
 import json
 import os
 import sys
 import traceback
+import types
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -196,6 +198,67 @@ def instances_with_equal_cuts_share_a_data_block():
     assert len(splats.data_blocks()) == len({item.data.name for item in items})
 
 
+def viewport_at(camera):
+    """Return a viewport that looks as a camera does; there is no window here."""
+    view = views.render_camera(bpy.context.scene, camera, depsgraph())
+    window = camera.calc_matrix_camera(depsgraph(), x=view.width, y=view.height)
+    looking = camera.matrix_world.normalized().inverted()
+    region = types.SimpleNamespace(
+        width=view.width, height=view.height, as_pointer=lambda: 1, tag_redraw=lambda: None
+    )
+    region_view = types.SimpleNamespace(
+        view_matrix=looking, window_matrix=window, perspective_matrix=window @ looking
+    )
+    return watch.Viewport(region, region_view, camera.data.clip_start)
+
+
+@check
+def the_timer_follows_the_view_and_the_instances():
+    bpy.ops.v3dg.open(filepath=make_bundle("ball.v3dg"))
+    item = bpy.context.object
+    camera = add_camera((0, -3, 0))
+    found = watch.viewports
+    sizes = []
+
+    def look():
+        watch._state.pace._not_before_s = 0.0  # no pause
+        watch.viewports = lambda: [viewport_at(camera)]
+        watch._look()
+        bpy.context.view_layer.update()
+        sizes.append((size(item), item.data.name))
+
+    try:
+        look()
+        assert sizes[0][0] == show.show_render(bpy.context.scene, depsgraph()).num_gaussians
+        look()  # nothing has changed
+        assert sizes[1] == sizes[0]
+        camera.location.y = -80
+        look()
+        assert sizes[2][0] < sizes[0][0]
+        item.location.y = -76
+        bpy.context.view_layer.update()
+        look()
+        assert sizes[3][0] > sizes[2][0]
+        item.v3dg.opacity = 0.5
+        look()
+        assert sizes[4][1] != sizes[3][1]
+        bpy.context.scene.v3dg.viewport_budget = 20
+        look()
+        assert 0 < sizes[5][0] <= 20
+        assert watch.status() == f"{sizes[5][0]} gaussians of 1 instances in 1 data blocks"
+        item.v3dg.bundle = os.path.abspath("moved.v3dg")
+        watch.expect_change()
+        look()
+        assert "moved.v3dg: expected a bundle" in watch.status()
+        bpy.context.scene.v3dg.follows = False
+        item.v3dg.bundle = os.path.abspath("ball.v3dg")
+        watch.expect_change()
+        look()
+        assert "moved.v3dg" in watch.status()
+    finally:
+        watch.viewports = found
+
+
 @check
 def what_is_not_in_view_shows_nothing_and_can_be_rendered():
     bpy.ops.v3dg.open(filepath=make_bundle("ball.v3dg"))
@@ -303,6 +366,55 @@ def empties_and_copies_are_saved():
         (2, 10, 0),
     ]
     assert source.data is not None
+
+
+def scatter(source, points):
+    """Add an object that places copies of another one at points, by geometry nodes."""
+    mesh = bpy.data.meshes.new("points")
+    mesh.from_pydata(points, [], [])
+    item = bpy.data.objects.new("scatter", mesh)
+    bpy.context.collection.objects.link(item)
+    tree = bpy.data.node_groups.new("scatter", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    start = tree.nodes.new("NodeGroupInput")
+    copied = tree.nodes.new("GeometryNodeObjectInfo")
+    copied.inputs["Object"].default_value = source
+    copied.inputs["As Instance"].default_value = True
+    copies = tree.nodes.new("GeometryNodeInstanceOnPoints")
+    end = tree.nodes.new("NodeGroupOutput")
+    tree.links.new(start.outputs[0], copies.inputs["Points"])
+    tree.links.new(copied.outputs["Geometry"], copies.inputs["Instance"])
+    tree.links.new(copies.outputs[0], end.inputs[0])
+    item.modifiers.new("scatter", "NODES").node_group = tree
+    bpy.context.view_layer.update()
+    return item
+
+
+@check
+def scattered_copies_are_saved_and_can_be_made_real():
+    bpy.ops.v3dg.open(filepath=make_bundle("ball.v3dg"))
+    source = bpy.context.object
+    points = [(float(number), 5.0, 0.0) for number in range(4)]
+    item = scatter(source, points)
+    operators.save_scene(bpy.context, "out.json")
+    positions = sorted(map(tuple, v3dg.Scene.load("out.json").positions.tolist()))
+    assert positions == [(0.0, 0.0, 0.0), *points]
+    if not splats.has_splats():
+        return  # the ellipsoids would become objects, too
+    bpy.ops.object.select_all(action="DESELECT")
+    item.select_set(state=True)
+    bpy.context.view_layer.objects.active = item
+    bpy.ops.object.duplicates_make_real()
+    bpy.data.objects.remove(item)
+    bpy.context.view_layer.update()
+    items = world.instances(bpy.context.scene)
+    assert sorted(tuple(item.location) for item in items) == [(0, 0, 0), *points]
+    add_camera((1.5, -10, 2), (1.5, 5, 0))
+    shown = show.show_render(bpy.context.scene, depsgraph())
+    assert shown.num_instances == 5
+    operators.save_scene(bpy.context, "again.json")
+    assert len(v3dg.Scene.load("again.json")) == 5
 
 
 @check
@@ -458,6 +570,22 @@ def a_saved_file_opens_with_its_cut_and_its_settings():
 
 
 @check
+def a_missing_package_is_named():
+    modules = {name: sys.modules[name] for name in list(sys.modules) if "v3dg" in name}
+    message = ""
+    try:
+        for name in modules:
+            del sys.modules[name]
+        sys.modules["v3dg"] = None  # which makes its import fail
+        importlib.import_module("v3dg_blender")
+    except ImportError as error:
+        message = str(error)
+    finally:
+        sys.modules.update(modules)
+    assert "Blender's Python cannot import the package v3dg" in message
+
+
+@check
 def the_addon_can_be_switched_off_and_on():
     v3dg_blender.unregister()
     assert not hasattr(bpy.types.Object, "v3dg")
@@ -477,6 +605,7 @@ def main():
             results[function.__name__] = ""
         except Exception:
             results[function.__name__] = traceback.format_exc()
+    v3dg_blender.unregister()
     Path("results.json").write_text(json.dumps(results))
 
 

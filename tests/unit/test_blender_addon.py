@@ -4,6 +4,7 @@ and its archive."""
 import importlib.util
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,6 +93,16 @@ def test_an_orthographic_view_is_seen_from_afar():
     expected = clip_pixels(view_matrix(), projection, points, 300, 200)
     # Depths of the points differ by a hundredth of the distance of the eye.
     np.testing.assert_allclose(camera_pixels(camera, points), expected, atol=0.01 * 300)
+
+
+def test_a_viewport_has_a_camera():
+    projection = perspective(300, 280, 100, 90, 240, 160)
+    region = SimpleNamespace(width=240, height=160)
+    view = SimpleNamespace(view_matrix=view_matrix().tolist(), window_matrix=projection.tolist())
+    camera = views.viewport_camera(region, view, 0.2)
+    expected = views.camera_of_projection(view_matrix(), projection, 240, 160, 0.2)
+    np.testing.assert_array_equal(camera.viewmat, expected.viewmat)
+    np.testing.assert_array_equal(camera.K, expected.K)
 
 
 def crowd(bundle):

@@ -3,6 +3,14 @@
 The add-on needs the package v3dg, whose wheel its archive holds (`pack.py`).
 """
 
+try:
+    import v3dg as v3dg
+except ImportError as error:
+    raise ImportError(
+        "v3dg_blender: Blender's Python cannot import the package v3dg; install the add-on from "
+        "an archive with its wheels, which integrations/blender/pack.py writes"
+    ) from error
+
 from . import operators, panel, properties, watch
 
 _MODULES = (properties, operators, panel, watch)

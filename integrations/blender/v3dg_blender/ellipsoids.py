@@ -8,6 +8,9 @@ ray through p along the unit vector d has the squared distance p.p - (p.d)^2.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
 import bpy
 
 NAME = "v3dg ellipsoids"
@@ -20,7 +23,8 @@ def material() -> bpy.types.Material:
     if NAME in bpy.data.materials:
         return bpy.data.materials[NAME]
     result = bpy.data.materials.new(NAME)
-    result.use_nodes = True
+    if result.node_tree is None:  # before 5.0
+        result.use_nodes = True
     tree = result.node_tree
     tree.nodes.clear()
     radiance = tree.nodes.new("ShaderNodeAttribute")
@@ -123,3 +127,18 @@ def add_modifier(target: bpy.types.Object) -> None:
     """Draw the points of a mesh object as ellipsoids."""
     modifier = target.modifiers.new(NAME, "NODES")
     modifier.node_group = node_group()
+
+
+@contextmanager
+def hidden(targets: Sequence[bpy.types.Object]) -> Iterator[None]:
+    """Draw no ellipsoids for a while, so that a dependency graph has the copies of mesh
+    objects themselves, and not those of their ellipsoids."""
+    modifiers = [target.modifiers[NAME] for target in targets if NAME in target.modifiers]
+    visible = [modifier for modifier in modifiers if modifier.show_viewport]
+    for modifier in visible:
+        modifier.show_viewport = False
+    try:
+        yield
+    finally:
+        for modifier in visible:
+            modifier.show_viewport = True

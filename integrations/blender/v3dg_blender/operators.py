@@ -12,7 +12,7 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 import v3dg
 
-from . import show, views, watch, world
+from . import ellipsoids, show, views, watch, world
 
 Result: TypeAlias = set[str]
 
@@ -188,8 +188,11 @@ def save_scene(context: bpy.types.Context, path: str) -> None:
         ValueError: An instance or a camera cannot be written.
         OSError: The file cannot be written, or a bundle cannot be read.
     """
+    with ellipsoids.hidden(world.instances(context.scene)):
+        context.view_layer.update()
+        depsgraph = context.evaluated_depsgraph_get()
+        scene = world.as_scene(world.placed(context.scene, depsgraph))
     depsgraph = context.evaluated_depsgraph_get()
-    scene = world.as_scene(world.placed(context.scene, depsgraph))
     cameras = {
         item.name: views.render_camera(context.scene, item, depsgraph)
         for item in context.scene.objects

@@ -62,6 +62,11 @@ def open_bundle(path: str) -> v3dg.Bundle:
         OSError: The file cannot be read.
         ValueError: The file is not a bundle.
     """
+    if not os.path.exists(path):
+        raise FileNotFoundError(
+            f"{path}: expected a bundle, got a path that does not exist; choose the file again "
+            "(v3dg > Instance > Bundle)"
+        )
     status = os.stat(path)
     opened = _open_bundles.get(path)
     if opened is None or (opened.size, opened.time_ns) != (status.st_size, status.st_mtime_ns):
@@ -220,9 +225,9 @@ def placed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[Place
     ]
     for copy in depsgraph.object_instances:
         source = copy.object.original
-        # The ellipsoids of an instance are copies that belong to the instance itself.
+        # Copies that an instance makes of itself are parts of its picture.
         is_copy = copy.is_instance and copy.parent is not None and copy.parent.original != source
-        if is_copy and source.v3dg.bundle and not copy.parent.original.v3dg.bundle:
+        if is_copy and source.v3dg.bundle:
             result.append(Placed(source, np.array(copy.matrix_world, np.float64)))
     return result
 
