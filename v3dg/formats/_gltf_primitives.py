@@ -301,7 +301,7 @@ class Primitive:
         return notes
 
     def _packed_notes(self, packed: _Packed) -> list[str]:
-        notes = list(spz.flag_notes(packed.header))
+        notes = spz.header_notes(packed.header)
         if self._is_released:
             notes.append(
                 f"Its .spz was turned from the axes of .spz to those of glTF, as {SPZ} says; "
