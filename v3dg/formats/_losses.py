@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from v3dg._json import JsonObject
 from v3dg.cleaning import SMALLEST_OPACITY, ball_of_most
-from v3dg.formats._packing import SH_C0, Limits, log_scales
+from v3dg.formats._packing import SH_C0, Limits, blocks, log_scales
 from v3dg.gaussians import Gaussians
-from v3dg.rotations import normalised
+from v3dg.rotations import normalised, product
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,7 @@ class Losses:
         position_error: Largest error of a coordinate, relative to the diameter of the
             ball that contains most gaussians.
         scale_error: Largest relative error of a scale that was not clipped.
-        rotation_error: Largest angle between a rotation and the one that was read, in
-            degrees.
+        rotation_error: Largest angle in degrees by which an ellipsoid is turned.
         color_error: Largest error of a colour of degree 0 that was not clipped; 1 is
             the difference between black and white.
         harmonics_error: Largest error of a coefficient of a higher degree that was not
@@ -124,11 +123,14 @@ def _largest_error(
 
 
 def _largest_angle(quats: npt.NDArray[np.floating], read: npt.NDArray[np.floating]) -> float:
-    """Return the largest angle in degrees between rotations, whose quaternions may
-    differ in length and sign."""
-    one = normalised(quats)
-    other = normalised(read)
-    # The chord, unlike the cosine, is exact for small angles.
-    chords = [np.linalg.norm(one - sign * other, axis=1) for sign in (1, -1)]
-    largest = np.minimum(*chords).max(initial=0.0)
-    return math.degrees(4 * math.asin(min(1.0, largest / 2)))
+    """Return the largest angle in degrees by which an ellipsoid is turned after reading.
+    Half turns about its own axes do not turn it."""
+    largest = 0.0
+    for rows in blocks(len(quats)):
+        back = normalised(quats[rows]) * np.array([1, -1, -1, -1])
+        # The components of the rotation between both. The largest one is that of no
+        # turn, or of a half turn about an axis.
+        between = np.sort(np.abs(product(back, normalised(read[rows]))), axis=1)
+        rest = np.linalg.norm(between[:, :3], axis=1)
+        largest = max(largest, 2 * np.arctan2(rest, between[:, 3]).max())
+    return math.degrees(largest)
