@@ -266,6 +266,11 @@ def _calls(shared, work):
     def drawn_at_once(**values):
         v3dg.Renderer(scene, device="cpu").render_batch(**values)
 
+    def drawn_among(**values):
+        channels = ("depth", "normal", "label", "weight")
+        mesh = v3dg.MeshLayer(**values)
+        v3dg.render(scene, camera, mesh=mesh, channels=channels, device="cpu")
+
     def tables(**values):
         kind = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
         mine = {
@@ -348,6 +353,8 @@ def _calls(shared, work):
                 "fade": 1.05,
                 "background": (0.0, 0.5, 1.0),
                 "depth": True,
+                "channels": ("median_depth", "clipped"),
+                "mesh": v3dg.MeshLayer(np.zeros((2, 6, 8, 3)), np.ones((2, 6, 8))),
                 "out": v3dg.BatchPlanes(
                     np.zeros((2, 6, 8, 4), np.float32), None, np.zeros((2, 6, 8), np.float32)
                 ),
@@ -356,6 +363,19 @@ def _calls(shared, work):
         "Scene.set_environment": (
             changed("set_environment"),
             {"environment": np.array([0, 3]), "ids": [0, 2]},
+        ),
+        "Scene.set_label": (changed("set_label"), {"label": np.array([0, 3]), "ids": [0, 2]}),
+        "MeshLayer": (
+            drawn_among,
+            {
+                "color": np.full((6, 8, 3), 0.5),
+                "depth": np.full((6, 8), 8.0),
+                "coverage": np.full((6, 8), 0.5),
+                "normal": np.full((6, 8, 3), 0.5),
+                "instance": np.full((6, 8), 7),
+                "label": np.full((6, 8), 3),
+                "light": "linear",
+            },
         ),
         "Clusters": (v3dg.Clusters, clusters),
         "Groups": (v3dg.Groups, groups),
@@ -380,7 +400,13 @@ def _calls(shared, work):
         ),
         "render an asset": (
             v3dg.render,
-            {"subject": asset, "camera": camera, "background": (0.0, 0.0, 0.0), "device": "cpu"},
+            {
+                "subject": asset,
+                "camera": camera,
+                "background": (0.0, 0.0, 0.0),
+                "channels": ("instance", "clipped"),
+                "device": "cpu",
+            },
         ),
         "render a cut": (
             v3dg.render,
