@@ -377,20 +377,20 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
         sh=np.ascontiguousarray(sh),
     )
     if harmonics.values is not None:
-        gaussians, color_notes = _in_srgb(prim, gaussians)
-        notes += color_notes
+        gaussians = _in_srgb(prim, gaussians, notes)
     return gaussians.trained(antialiased=_antialiased(prim)), notes
 
 
-def _in_srgb(prim: Usd.Prim, gaussians: Gaussians) -> tuple[Gaussians, list[str]]:
-    """Return the gaussians of a prim with colours in sRGB, and notes about their colour
-    space."""
+def _in_srgb(prim: Usd.Prim, gaussians: Gaussians, notes: list[str]) -> Gaussians:
+    """Return the gaussians of a prim with colours in sRGB. A sentence about any other
+    colour space is appended to the notes."""
     color_space = _color_space(prim)
-    if color_space in _SRGB:
-        return gaussians, []
     if color_space in _LINEAR:
-        return srgb_from_linear(gaussians), [conversion_note(color_space)]
-    return gaussians, [f"The colour space {color_space[:40]!a} was read as sRGB."]
+        notes.append(conversion_note(color_space))
+        return srgb_from_linear(gaussians)
+    if color_space not in _SRGB:
+        notes.append(f"The colour space {color_space[:40]!a} was read as sRGB.")
+    return gaussians
 
 
 def _color_space(prim: Usd.Prim) -> str:
