@@ -123,14 +123,14 @@ def _largest_error(
 
 
 def _largest_angle(quats: npt.NDArray[np.floating], read: npt.NDArray[np.floating]) -> float:
-    """Return the largest angle in degrees by which an ellipsoid is turned after reading.
+    """Return the largest angle in degrees by which reading turns an ellipsoid.
     Half turns about its own axes do not turn it."""
     largest = 0.0
     for rows in blocks(len(quats)):
-        back = normalised(quats[rows]) * np.array([1, -1, -1, -1])
-        # The components of the rotation between both. The largest one is that of no
-        # turn, or of a half turn about an axis.
-        between = np.sort(np.abs(product(back, normalised(read[rows]))), axis=1)
-        rest = np.linalg.norm(between[:, :3], axis=1)
-        largest = max(largest, 2 * np.arctan2(rest, between[:, 3]).max())
+        inverses = normalised(quats[rows]) * np.array([1, -1, -1, -1])
+        # The largest component of such a turn is that of no turn, or of a half turn
+        # about an axis.
+        turns = np.sort(np.abs(product(inverses, normalised(read[rows]))), axis=1)
+        sines = np.linalg.norm(turns[:, :3], axis=1)
+        largest = max(largest, 2 * np.arctan2(sines, turns[:, 3]).max())
     return math.degrees(largest)

@@ -376,13 +376,21 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
         opacities=opacities,
         sh=np.ascontiguousarray(sh),
     )
-    color_space = _color_space(prim)
-    if color_space in _LINEAR and harmonics.values is not None:
-        gaussians = srgb_from_linear(gaussians)
-        notes.append(conversion_note(color_space))
-    elif color_space not in (*_SRGB, *_LINEAR):
-        notes.append(f"The colour space {color_space[:40]!a} was read as sRGB.")
+    if harmonics.values is not None:
+        gaussians = _in_srgb(prim, gaussians, notes)
     return gaussians.trained(antialiased=_antialiased(prim)), notes
+
+
+def _in_srgb(prim: Usd.Prim, gaussians: Gaussians, notes: list[str]) -> Gaussians:
+    """Return the gaussians of a prim with colours in sRGB. A sentence about any other
+    colour space is appended to the notes."""
+    color_space = _color_space(prim)
+    if color_space in _LINEAR:
+        notes.append(conversion_note(color_space))
+        return srgb_from_linear(gaussians)
+    if color_space not in _SRGB:
+        notes.append(f"The colour space {color_space[:40]!a} was read as sRGB.")
+    return gaussians
 
 
 def _color_space(prim: Usd.Prim) -> str:
