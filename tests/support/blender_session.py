@@ -418,6 +418,25 @@ def scattered_copies_are_saved_and_can_be_made_real():
 
 
 @check
+def a_scene_without_instances_can_be_opened_shown_and_saved():
+    v3dg.write_scene("empty.json", v3dg.Scene())
+    bpy.ops.v3dg.open(filepath="empty.json")
+    add_camera((0, -3, 0))
+    bpy.ops.v3dg.update()
+    assert watch.status() == "0 gaussians of 0 instances in 0 data blocks"
+    bpy.ops.v3dg.save_scene(filepath=os.path.abspath("out.json"))
+    assert len(v3dg.Scene.load("out.json")) == 0
+    # Neither is anything shown when all instances are hidden.
+    bpy.ops.v3dg.open(filepath=make_bundle("ball.v3dg"))
+    item = bpy.context.object
+    item.hide_viewport = True
+    item.hide_render = True
+    view = views.render_camera(bpy.context.scene, bpy.context.scene.camera, depsgraph())
+    assert show.show_viewport(bpy.context.scene, depsgraph(), view).num_gaussians == 0
+    assert show.show_render(bpy.context.scene, depsgraph()).num_gaussians == 0
+
+
+@check
 def errors_are_reports():
     path = make_bundle("ball.v3dg")
     assert "missing.v3dg" in failure(bpy.ops.v3dg.open, filepath=os.path.abspath("missing.v3dg"))
@@ -445,6 +464,22 @@ def errors_are_reports():
         bpy.context.scene.v3dg.render_budget = 10_000
         bpy.ops.v3dg.update()
     assert not Path("refused.json").exists()
+
+
+@check
+def a_bundle_at_a_url_is_refused():
+    scene = v3dg.Scene()
+    scene.add(make_bundle("ball.v3dg"))
+    path = v3dg.Bundle.path
+    v3dg.Bundle.path = property(lambda bundle: "https://example.org/ball.v3dg")
+    try:
+        world.add_scene(scene, bpy.context.collection)
+    except ValueError as error:
+        message = str(error)
+    finally:
+        v3dg.Bundle.path = path
+    assert "ball.v3dg: expected a bundle on this machine, got a URL" in message
+    assert not world.instances(bpy.context.scene)
 
 
 @check

@@ -33,6 +33,13 @@ def reported(operator: bpy.types.Operator, work: Callable[[], None]) -> Result:
     return FINISHED
 
 
+def _absolute(path: str) -> str:
+    """Return the path that a file selector or a script gave, which may be relative to
+    the .blend file."""
+    absolute: str = bpy.path.abspath(path)
+    return os.path.abspath(absolute)
+
+
 class V3DG_OT_open(bpy.types.Operator, ImportHelper):
     """Open a bundle (.v3dg), or a scene (.json) with its instances and cameras"""
 
@@ -44,7 +51,7 @@ class V3DG_OT_open(bpy.types.Operator, ImportHelper):
     filter_glob: bpy.props.StringProperty(default="*.v3dg;*.json", options={"HIDDEN"})
 
     def execute(self, context: bpy.types.Context) -> Result:
-        return reported(self, lambda: open_file(context, self.filepath))
+        return reported(self, lambda: open_file(context, _absolute(self.filepath)))
 
 
 def open_file(context: bpy.types.Context, path: str) -> None:
@@ -178,7 +185,7 @@ class V3DG_OT_save_scene(bpy.types.Operator, ExportHelper):
     filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
 
     def execute(self, context: bpy.types.Context) -> Result:
-        return reported(self, lambda: save_scene(context, self.filepath))
+        return reported(self, lambda: save_scene(context, _absolute(self.filepath)))
 
 
 def save_scene(context: bpy.types.Context, path: str) -> None:

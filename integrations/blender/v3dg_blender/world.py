@@ -162,7 +162,11 @@ def new_instance(
 
 
 def add_scene(scene: v3dg.Scene, collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Add an object for each instance of a scene, whose `up` (else z) becomes z."""
+    """Add an object for each instance of a scene, whose `up` (else z) becomes z.
+
+    Raises:
+        ValueError: A bundle is at a URL.
+    """
     upright = v3dg.Scene()
     upright.add_scene(scene, up="z")
     turns = [_turn_back(bundle) for bundle in upright.bundles]
@@ -176,6 +180,8 @@ def add_scene(scene: v3dg.Scene, collection: bpy.types.Collection) -> list[bpy.t
         )
         path = upright.bundles[bundle].path
         assert path is not None
+        if "://" in path:
+            raise ValueError(f"{path}: expected a bundle on this machine, got a URL; download it")
         item = new_instance(path, matrix, collection)
         item.v3dg.importance = float(upright.importance[number])
         item.v3dg.opacity = float(upright.opacity[number])
