@@ -418,6 +418,38 @@ def scattered_copies_are_saved_and_can_be_made_real():
 
 
 @check
+def copies_show_what_the_nearest_of_them_needs():
+    bpy.ops.v3dg.open(filepath=make_bundle("ball.v3dg"))
+    source = bpy.context.object
+    source.hide_render = True
+    source.hide_viewport = True
+    scene = bpy.context.scene
+    # The nearest copy is in view only in part.
+    item = scatter(source, [(0.9, 0, 0), (0, 4, 0), (0, 9, 0), (30, 0, 0)])
+    camera = add_camera((0, -2, 0))
+    if not splats.has_splats():
+        return
+    scene.v3dg.tolerance_px2 = 30
+    shown = show.show_render(scene, depsgraph())
+    lens = views.render_camera(scene, camera, depsgraph())
+    near = v3dg.Scene()
+    near.add(source.v3dg.bundle, (0.9, 0, 0), up="z")
+    cut = v3dg.select(near, lens, tolerance=30, cull=False)
+    assert v3dg.select(near, lens, tolerance=30).num_gaussians < cut.num_gaussians
+    assert size(source) == cut.num_gaussians
+    assert shown.num_instances == 3
+    assert shown.num_gaussians == 3 * size(source)
+    for budget in (600, 90):
+        scene.v3dg.render_budget = budget
+        shown = show.show_render(scene, depsgraph())
+        assert 0 < 3 * size(source) == shown.num_gaussians <= budget
+    num_changes = watch._state.num_changes
+    item.location.x = 1
+    bpy.context.view_layer.update()
+    assert watch._state.num_changes > num_changes
+
+
+@check
 def a_scene_without_instances_can_be_opened_shown_and_saved():
     v3dg.write_scene("empty.json", v3dg.Scene())
     bpy.ops.v3dg.open(filepath="empty.json")

@@ -78,7 +78,8 @@ def open_file(context: bpy.types.Context, path: str) -> None:
     context.view_layer.objects.active = next(iter(items), None)
     prepare(context.scene)
     context.view_layer.update()
-    show.show_coarsest(world.visible(context.scene), context.evaluated_depsgraph_get())
+    depsgraph = context.evaluated_depsgraph_get()
+    show.show_coarsest(world.visible(context.scene, depsgraph))
     watch.expect_change()
 
 
@@ -170,7 +171,8 @@ class V3DG_OT_place(bpy.types.Operator):
                 source.v3dg.bundle, empty.matrix_world.copy(), empty.users_collection[0]
             )
         context.view_layer.update()
-        show.show_coarsest(world.visible(context.scene), context.evaluated_depsgraph_get())
+        depsgraph = context.evaluated_depsgraph_get()
+        show.show_coarsest(world.visible(context.scene, depsgraph))
         watch.expect_change()
         return FINISHED
 
@@ -195,7 +197,7 @@ def save_scene(context: bpy.types.Context, path: str) -> None:
         ValueError: An instance or a camera cannot be written.
         OSError: The file cannot be written, or a bundle cannot be read.
     """
-    with ellipsoids.hidden(world.instances(context.scene)):
+    with ellipsoids.hidden(world.sources()):
         context.view_layer.update()
         depsgraph = context.evaluated_depsgraph_get()
         scene = world.as_scene(world.placed(context.scene, depsgraph))
