@@ -33,6 +33,13 @@ def reported(operator: bpy.types.Operator, work: Callable[[], None]) -> Result:
     return FINISHED
 
 
+def _absolute(path: str) -> str:
+    """Return the path that a file selector or a script gave, which may be relative to
+    the .blend file."""
+    absolute: str = bpy.path.abspath(path)
+    return os.path.abspath(absolute)
+
+
 class V3DG_OT_open(bpy.types.Operator, ImportHelper):
     """Open a bundle (.v3dg), or a scene (.json) with its instances and cameras"""
 
@@ -44,7 +51,7 @@ class V3DG_OT_open(bpy.types.Operator, ImportHelper):
     filter_glob: bpy.props.StringProperty(default="*.v3dg;*.json", options={"HIDDEN"})
 
     def execute(self, context: bpy.types.Context) -> Result:
-        return reported(self, lambda: open_file(context, self.filepath))
+        return reported(self, lambda: open_file(context, _absolute(self.filepath)))
 
 
 def open_file(context: bpy.types.Context, path: str) -> None:
@@ -71,7 +78,8 @@ def open_file(context: bpy.types.Context, path: str) -> None:
     context.view_layer.objects.active = next(iter(items), None)
     prepare(context.scene)
     context.view_layer.update()
-    show.show_coarsest(world.visible(context.scene), context.evaluated_depsgraph_get())
+    depsgraph = context.evaluated_depsgraph_get()
+    show.show_coarsest(world.visible(context.scene, depsgraph))
     watch.expect_change()
 
 
@@ -163,7 +171,8 @@ class V3DG_OT_place(bpy.types.Operator):
                 source.v3dg.bundle, empty.matrix_world.copy(), empty.users_collection[0]
             )
         context.view_layer.update()
-        show.show_coarsest(world.visible(context.scene), context.evaluated_depsgraph_get())
+        depsgraph = context.evaluated_depsgraph_get()
+        show.show_coarsest(world.visible(context.scene, depsgraph))
         watch.expect_change()
         return FINISHED
 
@@ -178,7 +187,7 @@ class V3DG_OT_save_scene(bpy.types.Operator, ExportHelper):
     filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
 
     def execute(self, context: bpy.types.Context) -> Result:
-        return reported(self, lambda: save_scene(context, self.filepath))
+        return reported(self, lambda: save_scene(context, _absolute(self.filepath)))
 
 
 def save_scene(context: bpy.types.Context, path: str) -> None:
@@ -188,7 +197,7 @@ def save_scene(context: bpy.types.Context, path: str) -> None:
         ValueError: An instance or a camera cannot be written.
         OSError: The file cannot be written, or a bundle cannot be read.
     """
-    with ellipsoids.hidden(world.instances(context.scene)):
+    with ellipsoids.hidden(world.sources()):
         context.view_layer.update()
         depsgraph = context.evaluated_depsgraph_get()
         scene = world.as_scene(world.placed(context.scene, depsgraph))

@@ -123,7 +123,7 @@ def _look() -> float:
         settings.culls,
     )
     start_s = time.monotonic()
-    if _state.pace.is_due(key, start_s) and world.instances(scene):
+    if _state.pace.is_due(key, start_s) and world.sources():
         _show(scene, viewport)
         end_s = time.monotonic()
         _state.pace.note(key, end_s, end_s - start_s)
@@ -141,16 +141,22 @@ def _show(scene: bpy.types.Scene, viewport: Viewport) -> None:
 
 @persistent
 def _note_changes(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Make a new cut due when an instance has been moved, added or removed."""
-    for update in depsgraph.updates:
-        item = update.id.original
-        if isinstance(item, bpy.types.Object):
-            if item.v3dg.bundle and update.is_updated_transform:
-                _state.num_changes += 1
-                return
-        elif isinstance(item, bpy.types.Collection):
-            _state.num_changes += 1
-            return
+    """Make a new cut due when an instance or a copy may have been moved, added or
+    removed."""
+    if any(_may_move_instances(update) for update in depsgraph.updates):
+        _state.num_changes += 1
+
+
+def _may_move_instances(update: bpy.types.DepsgraphUpdate) -> bool:
+    item = update.id.original
+    if not isinstance(item, bpy.types.Object):
+        return isinstance(item, bpy.types.Collection)
+    if item.v3dg.bundle:
+        # Its geometry is that of its cut.
+        return bool(update.is_updated_transform)
+    is_scatter = any(modifier.type == "NODES" for modifier in item.modifiers)
+    has_changed = update.is_updated_transform or update.is_updated_geometry
+    return bool(has_changed and (is_scatter or item.is_instancer))
 
 
 @persistent
@@ -168,7 +174,7 @@ def _end_render(scene: bpy.types.Scene, *unused: object) -> None:
 @persistent
 def _show_render(scene: bpy.types.Scene, *unused: object) -> None:
     """Show the cut of the render camera, before each frame of a render."""
-    if not world.rendered(scene):
+    if not world.sources():
         return
     depsgraph = bpy.context.evaluated_depsgraph_get()
     if scene.frame_current != _state.evaluated_frame:

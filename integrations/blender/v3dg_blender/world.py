@@ -80,26 +80,58 @@ def close_bundles() -> None:
     _open_bundles.clear()
 
 
+def sources() -> list[bpy.types.Object]:
+    """Return all objects of the file that show a bundle. Copies show objects that need
+    not be in the scene themselves."""
+    return [item for item in bpy.data.objects if item.v3dg.bundle and item.type != "EMPTY"]
+
+
 def instances(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Return the objects that show a bundle."""
+    """Return the objects of a scene that show a bundle."""
     return [item for item in scene.objects if item.v3dg.bundle and item.type != "EMPTY"]
 
 
-def rendered(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Return the instances that renders show."""
-    return [item for item in instances(scene) if not item.hide_render]
+def rendered(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[Placed]:
+    """Return the instances that renders show, and their copies."""
+    items = [item for item in instances(scene) if not item.hide_render]
+    return [*own_placements(items, depsgraph), *_shown_copies(depsgraph)]
 
 
-def visible(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Return the instances that viewports show."""
-    return [item for item in instances(scene) if item.visible_get()]
+def visible(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[Placed]:
+    """Return the instances that viewports show, and their copies."""
+    items = [item for item in instances(scene) if item.visible_get()]
+    return [*own_placements(items, depsgraph), *_shown_copies(depsgraph)]
 
 
-def poses(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> Floats:
-    """Return (I, 4, 4) the matrices of objects at the time of a dependency graph."""
-    matrices = [item.evaluated_get(depsgraph).matrix_world for item in items]
-    result: Floats = np.array(matrices, np.float64).reshape(-1, 4, 4)
+def own_placements(
+    items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph
+) -> list[Placed]:
+    """Return objects at their own poses, at the time of a dependency graph."""
+    return [
+        Placed(item, np.array(item.evaluated_get(depsgraph).matrix_world, np.float64))
+        for item in items
+    ]
+
+
+def copies(depsgraph: bpy.types.Depsgraph) -> list[Placed]:
+    """Return the copies of instances that collections and geometry nodes make."""
+    result: list[Placed] = []
+    for copy in depsgraph.object_instances:
+        if not copy.is_instance or copy.parent is None:
+            continue
+        source = copy.object.original
+        # Copies that an instance makes of itself are parts of its picture.
+        if source.v3dg.bundle and copy.parent.original != source:
+            result.append(Placed(source, np.array(copy.matrix_world, np.float64)))
     return result
+
+
+def _shown_copies(depsgraph: bpy.types.Depsgraph) -> list[Placed]:
+    """Return copies for which cuts are chosen. Copies of ellipsoids cannot be told
+    from copies of their objects, so there are none before Blender 5.3."""
+    if splats.has_splats():
+        return copies(depsgraph)
+    return []
 
 
 def add_instances(
@@ -108,8 +140,11 @@ def add_instances(
     """Add objects to a scene of v3dg, at similarities (I, 4, 4)."""
     if not items:
         return
+    # Thousands of instances have few files, of which each is looked up once.
+    examples = {(item.v3dg.bundle, item.library): item for item in items}
+    bundles = {key: open_bundle(bundle_path(item)) for key, item in examples.items()}
     scene.add(
-        [open_bundle(bundle_path(item)) for item in items],
+        [bundles[item.v3dg.bundle, item.library] for item in items],
         matrix=matrices,
         importance=[item.v3dg.importance for item in items],
         opacity=[item.v3dg.opacity for item in items],
@@ -162,7 +197,11 @@ def new_instance(
 
 
 def add_scene(scene: v3dg.Scene, collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Add an object for each instance of a scene, whose `up` (else z) becomes z."""
+    """Add an object for each instance of a scene, whose `up` (else z) becomes z.
+
+    Raises:
+        ValueError: A bundle is at a URL.
+    """
     upright = v3dg.Scene()
     upright.add_scene(scene, up="z")
     turns = [_turn_back(bundle) for bundle in upright.bundles]
@@ -176,6 +215,8 @@ def add_scene(scene: v3dg.Scene, collection: bpy.types.Collection) -> list[bpy.t
         )
         path = upright.bundles[bundle].path
         assert path is not None
+        if "://" in path:
+            raise ValueError(f"{path}: expected a bundle on this machine, got a URL; download it")
         item = new_instance(path, matrix, collection)
         item.v3dg.importance = float(upright.importance[number])
         item.v3dg.opacity = float(upright.opacity[number])
@@ -220,16 +261,7 @@ def placed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[Place
     """Return what a scene file holds: all instances that are rendered, empties with a
     bundle, and copies that collections and geometry nodes make."""
     items = [item for item in scene.objects if item.v3dg.bundle and not item.hide_render]
-    result = [
-        Placed(item, matrix) for item, matrix in zip(items, poses(items, depsgraph), strict=True)
-    ]
-    for copy in depsgraph.object_instances:
-        source = copy.object.original
-        # Copies that an instance makes of itself are parts of its picture.
-        is_copy = copy.is_instance and copy.parent is not None and copy.parent.original != source
-        if is_copy and source.v3dg.bundle:
-            result.append(Placed(source, np.array(copy.matrix_world, np.float64)))
-    return result
+    return [*own_placements(items, depsgraph), *copies(depsgraph)]
 
 
 def as_scene(items: Iterable[Placed]) -> v3dg.Scene:
