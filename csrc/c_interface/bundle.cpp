@@ -29,7 +29,7 @@ std::string shown(T value) {
         return std::to_string(value);
 }
 
-// Returns `width` values of a row of a table, as Python shows lists. Row -1 is the last.
+// Returns `width` values of a row of a table, as Python shows them. Row -1 is the last.
 template <class T>
 std::string row_text(Span<const T> values, int64_t row, size_t width) {
     const size_t number = row < 0 ? values.size / width - 1 : static_cast<size_t>(row);
