@@ -104,6 +104,20 @@ def test_scenes_of_the_corpus_are_judged_alike(folder):
             check_same(read_scene, path)
 
 
+def test_what_the_fuzzer_of_the_library_kept_is_judged_alike(folder):
+    with zipfile.ZipFile(CORPUS / "c_library.zip") as archive:
+        names = archive.namelist()
+        assert len(names) > 100
+        for name in names:
+            content = archive.read(name)
+            if content.startswith(b"{"):
+                (folder / "fuzz.json").write_bytes(content)
+                check_same(read_scene, folder / "fuzz.json")
+                continue
+            (folder / "fuzz.v3dg").write_bytes(with_fitting_hashes(content))
+            check_same(Bundle.open, folder / "fuzz.v3dg")
+
+
 def test_changed_scenes_are_judged_alike(folder):
     path = folder / "fuzz.json"
     good = json.dumps(GOOD | {"bundles": {"donut": "a.v3dg"}}).encode()
