@@ -1,4 +1,5 @@
-"""OpenUSD, in and out, checked with its own validators and its own choice of levels."""
+"""OpenUSD is read and written. OpenUSD's own validators check the files, and its own
+choice of levels is tested."""
 
 import json
 import math
@@ -46,6 +47,19 @@ def test_an_asset_reads_back(tmp_path, suffix, degree):
         assert (tmp_path / "a.usda").read_text().startswith("#usda 1.0")
 
 
+@pytest.mark.parametrize("degree", range(4))
+def test_coefficients_say_how_many_belong_to_a_gaussian(tmp_path, degree):
+    """Requirement VG.035 of NVIDIA's usd-validation: interpolation `vertex`, and an
+    elementSize of the degree's number of coefficients."""
+    path = tmp_path / "a.usdc"
+    v3dg.write_asset(path, random_gaussians(np.random.default_rng(0), 5, degree))
+    stage = Usd.Stage.Open(os.fspath(path))
+    prim = stage.GetDefaultPrim()
+    harmonics = UsdGeom.Primvar(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients"))
+    assert harmonics.GetInterpolation() == "vertex"
+    assert harmonics.GetElementSize() == (degree + 1) ** 2
+
+
 def test_no_gaussians_are_written(tmp_path):
     v3dg.write_asset(tmp_path / "a.usdc", random_gaussians(np.random.default_rng(0), 0, 1))
     assert len(v3dg.read_asset(tmp_path / "a.usdc")) == 0
@@ -87,8 +101,7 @@ def test_a_bundle_has_its_levels(tmp_path, seed):
 
 
 def test_usd_chooses_the_level_that_selection_has(tmp_path):
-    """Level 1 begins where half of its groups are enough, for a picture of 1920 x
-    1080."""
+    """In a picture of 1920 x 1080, level 1 begins where half of its groups suffice."""
     bundle = random_bundle(3, num_levels=4)
     write_usd(bundle, tmp_path / "a.usdc", up="z")
     stage = Usd.Stage.Open(os.fspath(tmp_path / "a.usdc"))
@@ -123,8 +136,8 @@ def test_a_scene_is_a_point_instancer(tmp_path):
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/world")))
     np.testing.assert_allclose([0, 1, 0, 0] @ world, [0, 0, 1, 0], atol=1e-6)  # y becomes z
     for i, matrix in enumerate(matrices):
-        # USD has vectors as rows; instances are before the prototypes' own transforms,
-        # which have none.
+        # Vectors in OpenUSD are rows. Instances come before the prototypes' own
+        # transforms, which are empty.
         np.testing.assert_allclose(
             matrix[:3, :3].T, scene.scales[i] * scene.rotations[i], atol=1e-3
         )
@@ -192,7 +205,7 @@ def test_without_usd_core_the_error_says_how_to_get_it(tmp_path, monkeypatch):
 
 
 def world_means(scene):
-    """Means of all gaussians of the finest levels, in the world."""
+    """Return the means of all gaussians of the finest levels, in the world."""
     found = [scene.bundles[b].level_gaussians(0).means for b in scene.instance_bundle]
     poses = zip(found, scene.rotations, scene.scales, scene.positions, strict=True)
     means = np.concatenate(
@@ -221,8 +234,8 @@ def test_a_scene_reads_back_as_a_scene(tmp_path, suffix):
 
 @pytest.mark.parametrize("is_instanceable", [True, False])
 def test_references_to_an_asset_are_instances_of_it(tmp_path, is_instanceable):
-    """Of files beside, in Xforms in Xforms; what is alone has one, and changed values
-    are another asset."""
+    """The references are to files in the same folder, from nested Xforms. An asset
+    without references is one instance, and a changed asset is another asset."""
     asset = Usd.Stage.CreateNew(os.fspath(tmp_path / "asset.usdc"))
     asset.SetDefaultPrim(UsdGeom.Xform.Define(asset, "/house").GetPrim())
     v3dg.formats.usd.define(
@@ -267,7 +280,7 @@ def test_instancers_may_hold_instancers_and_hide_instances(tmp_path):
         )
         instancer.CreateProtoIndicesAttr([0, 0, 0])
         instancer.CreatePositionsAttr([Gf.Vec3f(*step) * k for k in range(3)])
-        # In half precision, as most programs write them.
+        # In half precision, like most programs.
         instancer.CreateOrientationsAttr([Gf.Quath(0.5, 0.5, -0.5, 0.5)] * 3)
     UsdGeom.PointInstancer(stage.GetPrimAtPath("/rows")).InvisId(1, 0)
     stage.GetRootLayer().Save()
@@ -304,7 +317,7 @@ def new_stage(path):
 
 
 def read_with_notes(path):
-    """Gaussians with the axes of their stage, and what else is declared."""
+    """Return gaussians in the axes of their stage, and what else the file declares."""
     file = open_asset(path)
     return half_turn(file.read(0, file.num_gaussians), "x"), list(file.declared.notes)
 
@@ -313,7 +326,8 @@ POINTS = [Gf.Vec3f(1, 2, 3), Gf.Vec3f(4, 5, 6)]
 
 
 def test_what_is_left_out_has_the_default_of_the_schema(tmp_path):
-    """Which its documentation has: no rotation, unit scale, opaque, of one grey."""
+    """The defaults in its documentation are: no rotation, unit scale, opaque, and one
+    grey."""
     stage = new_stage(tmp_path / "a.usda")
     new_prim(stage).GetAttribute("positions").Set(POINTS)
     stage.GetRootLayer().Save()
@@ -347,7 +361,8 @@ def test_the_degree_of_harmonics_is_3_by_default(tmp_path):
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_array_equal(found.sh, values.reshape(2, 16, 3))
     assert notes == []
-    # Of degree 4 they are too few, and ignored; of degree 2 the last ones are left out.
+    # They are too few for degree 4, and ignored; for degree 2 the last ones are left
+    # out.
     prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(4)
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
@@ -382,7 +397,7 @@ def test_coefficients_above_degree_3_are_left_out(tmp_path):
 
 
 def test_halves_stand_for_floats(tmp_path):
-    """Where there are both, floats are used."""
+    """If a file has both, the floats are used."""
     stage = new_stage(tmp_path / "a.usda")
     prim = new_prim(stage)
     prim.GetAttribute("positionsh").Set([Gf.Vec3h(1, 2, 3), Gf.Vec3h(4, 5, 6)])

@@ -37,7 +37,7 @@ PLY_SOURCES = {
 }
 MAX_BYTES = {"ply": 8192, "c_library": 16384}
 KEPT_BYTES = {"ply": 1000, "c_library": 12000}
-LARGEST_SEED = 10_000  # bytes; a few of the broken files are made to be large
+LARGEST_SEED = 10_000  # bytes; a few of the broken files are made large
 
 
 def ply_seeds():

@@ -503,6 +503,11 @@ def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
+    # Without these a reader that goes by primvars takes one coefficient for each
+    # gaussian; NVIDIA's requirement VG.035 asks for both.
+    harmonics = usd.UsdGeom.Primvar(prim.GetAttribute(f"{_SH}Coefficients"))
+    harmonics.SetInterpolation(usd.UsdGeom.Tokens.vertex)
+    harmonics.SetElementSize((host.sh_degree + 1) ** 2)
     if host.antialiased is not None:
         prim.SetCustomDataByKey(_ANTIALIASED, host.antialiased)
     return prim
