@@ -61,6 +61,25 @@ def test_coefficients_say_how_many_belong_to_a_gaussian(tmp_path, degree):
     assert harmonics.GetElementSize() == (degree + 1) ** 2
 
 
+@pytest.mark.witness
+@pytest.mark.parametrize("name", ["asset.usdc", "asset.usdz", "scene.usda"])
+def test_nvidias_rules_find_nothing(tmp_path, name):
+    """Those of usd-validation-nvidia that it has on, but for its advice to store large
+    arrays in binary files; and the rule for splats."""
+    nvidia = pytest.importorskip("usd_validation_nvidia")
+    generator = np.random.default_rng(0)
+    if name == "scene.usda":
+        scene = v3dg.Scene()
+        scene.add(random_bundle(generator), positions=[[0, 0, 0], [3, 0, 0]])
+        write_usd(scene, tmp_path / name)
+    else:
+        v3dg.write_asset(tmp_path / name, random_gaussians(generator, 50, 3))
+    engine = nvidia.ValidationEngine()
+    engine.enable_rule(nvidia.GaussianSplatSchemaChecker)
+    found = [str(issue) for issue in engine.validate(os.fspath(tmp_path / name)).issues()]
+    assert [text for text in found if "UsdAsciiPerformanceChecker" not in text] == []
+
+
 def test_no_gaussians_are_written(tmp_path):
     v3dg.write_asset(tmp_path / "a.usdc", random_gaussians(np.random.default_rng(0), 0, 1))
     assert len(v3dg.read_asset(tmp_path / "a.usdc")) == 0
