@@ -30,7 +30,9 @@ def run(*command, **options):
 def prefix(tmp_path_factory):
     """The folder into which the library is installed."""
     folder = tmp_path_factory.mktemp("prefix")
-    run("cmake", "--install", c_library.built(), "--prefix", folder)
+    build = c_library.built()
+    with c_library.building():
+        run("cmake", "--install", build, "--prefix", folder)
     return folder
 
 
