@@ -26,7 +26,7 @@ constexpr uint64_t kMostBudget = std::numeric_limits<int64_t>::max();
 
 // A cut with the memory of its arrays.
 struct OwnedCut : v3dg_cut {
-    std::vector<v3dg_pair> pairs_memory;
+    Buffer<v3dg_pair> pairs_memory;
     std::vector<v3dg_missing_page> missing_memory;
 };
 
@@ -246,12 +246,12 @@ v3dg_cut* select_cut(const v3dg_scene& scene, const Eyes& eyes, const v3dg_rule&
                         std::to_string(rule.budget));
     auto cut = std::make_unique<OwnedCut>();
     const bool fades = checked.fade.is_on();
-    cut->pairs_memory.resize(selected.instance.size());
-    parallel_for(selected.instance.size(), 4096,
-                 [&](size_t s) { cut->pairs_memory[s] = pair_of(scene, selected, s, fades); });
+    const size_t num_pairs = selected.instance.size();
+    v3dg_pair* pairs = cut->pairs_memory.reserve(num_pairs + 1);
+    parallel_for(num_pairs, 4096, [&](size_t s) { pairs[s] = pair_of(scene, selected, s, fades); });
     cut->missing_memory = missing_pages(scene, tables);
-    cut->pairs = cut->pairs_memory.data();
-    cut->num_pairs = cut->pairs_memory.size();
+    cut->pairs = pairs;
+    cut->num_pairs = num_pairs;
     cut->num_gaussians = static_cast<uint64_t>(selected.num_gaussians);
     cut->missing = cut->missing_memory.data();
     cut->num_missing = cut->missing_memory.size();

@@ -26,23 +26,26 @@ static v3dg_status find_camera(const v3dg_scene* scene, v3dg_camera* camera) {
     return v3dg_look_at(eye, target, up, 0.8, 1280, 720, 0.01, camera);
 }
 
-/* Prints how many clusters and gaussians of each level of the first bundle are in a cut. */
+/* Prints how many clusters and gaussians of each level of the first bundle a cut contains. */
 static v3dg_status print_levels(const v3dg_scene* scene, const v3dg_cut* cut) {
-    uint64_t clusters[64] = {0};
-    uint64_t gaussians[64] = {0};
-    v3dg_bundle_info info;
-    v3dg_status status = v3dg_get_bundle_info(scene, 0, &info);
+    v3dg_bundle_info bundle;
+    uint64_t* counts; /* clusters and gaussians of each level */
+    v3dg_status status = v3dg_get_bundle_info(scene, 0, &bundle);
     if (status != V3DG_OK) return status;
+    counts = calloc(bundle.num_levels + 1, 2 * sizeof *counts);
+    if (counts == NULL) abort();
     for (uint64_t i = 0; i < cut->num_pairs && status == V3DG_OK; ++i) {
         v3dg_page_info page;
         status = v3dg_get_page_info(scene, 0, cut->pairs[i].page, &page);
-        if (status != V3DG_OK || page.level >= 64) break;
-        ++clusters[page.level];
-        gaussians[page.level] += cut->pairs[i].num_gaussians;
+        if (status != V3DG_OK) break;
+        counts[2 * page.level] += 1;
+        counts[2 * page.level + 1] += cut->pairs[i].num_gaussians;
     }
-    for (uint32_t level = 0; level < info.num_levels && level < 64; ++level)
-        printf("level %" PRIu32 ": %" PRIu64 " clusters, %" PRIu64 " gaussians\n", level,
-               clusters[level], gaussians[level]);
+    for (uint32_t level = 0; level < bundle.num_levels; ++level)
+        if (counts[2 * level] > 0)
+            printf("level %" PRIu32 ": %" PRIu64 " clusters, %" PRIu64 " gaussians\n", level,
+                   counts[2 * level], counts[2 * level + 1]);
+    free(counts);
     return status;
 }
 
