@@ -45,9 +45,12 @@ def write_world(path: Path, donut: str, oak: str) -> None:
     places[is_oak, 2] = -0.18  # the trunk begins above the origin of the asset
     scene = v3dg.Scene()
     scene.up = "z"
-    for bundle, chosen, size in ((oak, is_oak, 0.11), (donut, ~is_oak, 2.2)):
+    for bundle, is_placed, size in ((oak, is_oak, 0.11), (donut, ~is_oak, 2.2)):
         scene.add(
-            v3dg.Bundle.open(bundle), places[chosen], quaternions[chosen], size * scales[chosen]
+            v3dg.Bundle.open(bundle),
+            places[is_placed],
+            quaternions[is_placed],
+            size * scales[is_placed],
         )
     camera = v3dg.Camera.look_at(
         (0.3, -2.2, 1.15), (0.1, 3, 0.15), fov_x=0.9, width=600, height=375

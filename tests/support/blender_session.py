@@ -471,6 +471,24 @@ def a_scene_without_instances_can_be_opened_shown_and_saved():
 
 
 @check
+def what_a_camera_loses_is_a_warning():
+    scene = v3dg.Scene()
+    scene.add(make_bundle("ball.v3dg"))
+    plain = v3dg.Camera.look_at((0, -4, 0), (0, 0, 0), width=40, height=30)
+    curved = v3dg.Camera(plain.viewmat, plain.K, 40, 30, distortion=(0.1, 0, 0, 0), model="OPENCV")
+    oblong = v3dg.Camera(plain.viewmat, plain.K * [[1], [2], [1]], 40, 30)
+    cameras = {"plain": plain, "curved": curved, "oblong": oblong}
+    v3dg.write_scene("in.json", scene, cameras=cameras)
+    warnings = operators.open_file(bpy.context, os.path.abspath("in.json"))
+    assert [text.split(":")[0] for text in warnings] == ["curved", "oblong"]
+    assert operators.save_scene(bpy.context, "out.json") == []
+    bpy.data.objects["plain"].data.type = "ORTHO"
+    (warning,) = operators.save_scene(bpy.context, "out.json")
+    assert warning.startswith("plain: left out")
+    assert sorted(v3dg.read_scene("out.json")[1]) == ["curved", "oblong"]
+
+
+@check
 def errors_are_reports():
     path = make_bundle("ball.v3dg")
     assert "missing.v3dg" in failure(bpy.ops.v3dg.open, filepath=os.path.abspath("missing.v3dg"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from typing import ClassVar, TypeAlias
@@ -23,13 +24,16 @@ CANCELLED = {"CANCELLED"}
 _TRANSPARENT_BOUNCES = 256
 
 
-def reported(operator: bpy.types.Operator, work: Callable[[], None]) -> Result:
-    """Do an operator's work, and report what a user can be wrong about."""
+def reported(operator: bpy.types.Operator, work: Callable[[], list[str]]) -> Result:
+    """Do an operator's work, and report what a user can be wrong about, and the
+    warnings that the work returns."""
     try:
-        work()
+        warnings = work()
     except (OSError, ValueError, ImportError) as error:
         operator.report({"ERROR"}, str(error))
         return CANCELLED
+    for warning in warnings:
+        operator.report({"WARNING"}, warning)
     return FINISHED
 
 
@@ -54,18 +58,19 @@ class V3DG_OT_open(bpy.types.Operator, ImportHelper):
         return reported(self, lambda: open_file(context, _absolute(self.filepath)))
 
 
-def open_file(context: bpy.types.Context, path: str) -> None:
-    """Open a bundle at the 3D cursor, or a scene.
+def open_file(context: bpy.types.Context, path: str) -> list[str]:
+    """Open a bundle at the 3D cursor, or a scene. Return warnings.
 
     Raises:
         ValueError: The file is neither, or invalid.
         OSError: The file cannot be read.
     """
     name = os.path.basename(path)
+    warnings: list[str] = []
     if name.endswith(".v3dg"):
         items = [_open_bundle(context, path)]
     elif name.endswith(".json"):
-        items = _open_scene(context, path)
+        items = _open_scene(context, path, warnings)
     else:
         raise ValueError(
             f"{name}: expected a bundle (.v3dg) or a scene (.json); make a bundle of an asset "
@@ -81,6 +86,7 @@ def open_file(context: bpy.types.Context, path: str) -> None:
     depsgraph = context.evaluated_depsgraph_get()
     show.show_coarsest(world.visible(context.scene, depsgraph))
     watch.expect_change()
+    return warnings
 
 
 def prepare(scene: bpy.types.Scene) -> None:
@@ -98,7 +104,9 @@ def _open_bundle(context: bpy.types.Context, path: str) -> bpy.types.Object:
     return world.new_instance(path, matrix, context.collection)
 
 
-def _open_scene(context: bpy.types.Context, path: str) -> list[bpy.types.Object]:
+def _open_scene(
+    context: bpy.types.Context, path: str, warnings: list[str]
+) -> list[bpy.types.Object]:
     scene, cameras = v3dg.read_scene(path)
     name = os.path.splitext(os.path.basename(path))[0]
     collection = bpy.data.collections.new(name)
@@ -107,6 +115,8 @@ def _open_scene(context: bpy.types.Context, path: str) -> list[bpy.types.Object]
     turn = world.turn_upright(scene)
     for name, camera in cameras.items():
         _add_camera(context, name, camera, turn, collection)
+        if camera.is_distorted or not math.isclose(camera.fx, camera.fy, rel_tol=1e-4):
+            warnings.append(f"{name}: lens distortion and oblong pixels are left out")
     return items
 
 
@@ -137,7 +147,7 @@ class V3DG_OT_update(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Result:
         return reported(self, lambda: self._update(context))
 
-    def _update(self, context: bpy.types.Context) -> None:
+    def _update(self, context: bpy.types.Context) -> list[str]:
         context.view_layer.update()
         depsgraph = context.evaluated_depsgraph_get()
         viewport = watch.current_viewport()
@@ -147,6 +157,7 @@ class V3DG_OT_update(bpy.types.Operator):
             counts = show.show_viewport(context.scene, depsgraph, viewport.camera())
         watch.set_status(counts)
         self.report({"INFO"}, watch.status())
+        return []
 
 
 class V3DG_OT_place(bpy.types.Operator):
@@ -190,8 +201,8 @@ class V3DG_OT_save_scene(bpy.types.Operator, ExportHelper):
         return reported(self, lambda: save_scene(context, _absolute(self.filepath)))
 
 
-def save_scene(context: bpy.types.Context, path: str) -> None:
-    """Write the instances and cameras of the scene.
+def save_scene(context: bpy.types.Context, path: str) -> list[str]:
+    """Write the instances and cameras of the scene. Return warnings.
 
     Raises:
         ValueError: An instance or a camera cannot be written.
@@ -202,12 +213,20 @@ def save_scene(context: bpy.types.Context, path: str) -> None:
         depsgraph = context.evaluated_depsgraph_get()
         scene = world.as_scene(world.placed(context.scene, depsgraph))
     depsgraph = context.evaluated_depsgraph_get()
+    items = [
+        item for item in context.scene.objects if item.type == "CAMERA" and not item.hide_render
+    ]
     cameras = {
         item.name: views.render_camera(context.scene, item, depsgraph)
-        for item in context.scene.objects
-        if item.type == "CAMERA" and item.data.type == "PERSP" and not item.hide_render
+        for item in items
+        if item.data.type == "PERSP"
     }
     v3dg.write_scene(path, scene, cameras=cameras)
+    return [
+        f"{item.name}: left out, because scene files have perspective cameras only"
+        for item in items
+        if item.name not in cameras
+    ]
 
 
 class V3DG_FH_open(bpy.types.FileHandler):
