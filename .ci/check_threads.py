@@ -77,7 +77,7 @@ def cuda_headers() -> Path | None:
 
 
 def include_options(csrc: Path) -> list[str]:
-    options = ["-I", str(csrc)]
+    options = ["-I", str(csrc), "-I", str(CSRC.parent / "include")]
     if importlib.util.find_spec("pybind11") is not None:
         import pybind11
 
