@@ -61,13 +61,16 @@ lint() {
     pre-commit run --all-files --show-diff-on-failure
 }
 
-# Compiles the module and the C++ example that tests/system/test_cpp_example.py runs. CXX is the name of the compiler.
-# V3DG_WERROR=ON treats its warnings as errors; V3DG_CUDA=ON also compiles the CUDA sources.
+# Compiles the module, the C library and the C++ example that tests/system/test_cpp_example.py runs. CXX is the name of
+# the compiler. V3DG_WERROR=ON treats its warnings as errors; V3DG_CUDA=ON also compiles the CUDA sources.
 compile() {
     if [ -d "$ci/venv" ]; then enter; else environment; fi
-    pip install --quiet cmake ninja 'pybind11>=2.13'
+    pip install --quiet cmake ninja 'pybind11>=2.13' nlohmann-json
+    local json
+    json=$(python -c "import nlohmann_json; print(nlohmann_json.__path__[0])")/include
     cmake -S . -B "$ci/cpp" -G Ninja -DCMAKE_BUILD_TYPE=Release -DV3DG_CUDA="${V3DG_CUDA:-OFF}" \
-        -DV3DG_WERROR="${V3DG_WERROR:-OFF}" -Dpybind11_DIR="$(python -m pybind11 --cmakedir)" > /dev/null
+        -DV3DG_WERROR="${V3DG_WERROR:-OFF}" -Dpybind11_DIR="$(python -m pybind11 --cmakedir)" \
+        -DV3DG_C_LIBRARY=ON -DV3DG_JSON_INCLUDE_DIR="$json" > /dev/null
     cmake --build "$ci/cpp" --target all draw_scene > "$ci/cpp.log" || { cat "$ci/cpp.log" >&2; return 1; }
 }
 

@@ -211,7 +211,7 @@ def test_blocks_are_all_found(page):
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(page):
     text = (ROOT / page).read_text(encoding="utf-8")
-    made_for_the_site = {"contributing.md", "style.md", "changelog.md"}
+    made_for_the_site = {"contributing.md", "style.md", "changelog.md", "tutorial.md"}
     for target in re.findall(r"\]\(([^)#\s]+)", text):
         if "://" not in target and target not in made_for_the_site:
             assert (ROOT / page).parent.joinpath(target).exists(), f"{page}: {target}"
@@ -226,7 +226,9 @@ def test_every_experiment_is_in_the_index():
 
 
 def test_notebook_runs_and_keeps_no_output(tmp_path, monkeypatch):
-    notebook = json.loads((ROOT / "examples" / "first_steps.ipynb").read_text(encoding="utf-8"))
+    notebook = json.loads(
+        (ROOT / "docs" / "notebooks" / "tutorial.ipynb").read_text(encoding="utf-8")
+    )
     monkeypatch.chdir(tmp_path)
     tiny.shrink(monkeypatch.setattr, monkeypatch.setitem)
     smaller = {
@@ -239,6 +241,8 @@ def test_notebook_runs_and_keeps_no_output(tmp_path, monkeypatch):
         if cell["cell_type"] == "code":
             assert cell["outputs"] == []
             code = "".join(cell["source"])
+            if code.startswith("%pip install"):
+                continue
             for large in [large for large in smaller if large in code]:
                 code = code.replace(large, smaller.pop(large))
             exec(compile(code, f"cell {number}", "exec"), names)

@@ -57,6 +57,17 @@ MAY_INCLUDE = {
         "fit_group",
         "draw",
     },
+    "c_interface": {
+        "base",
+        "math",
+        "camera",
+        "io",
+        "cluster",
+        "gather",
+        "quantize",
+        "residency",
+        "select",
+    },
     "bindings": {
         "base",
         "math",
@@ -84,6 +95,7 @@ NOT_OPERATIONS = {
     "residency",
     "draw",
     "levels",
+    "c_interface",
     "bindings",
 }
 TESTED_WITH = {"tile_bin": "rasterize"}
@@ -111,8 +123,11 @@ def module_name(path):
 
 def test_cmake_lists_every_source_once():
     lists = (
+        "CUT_SIMD_SOURCES",
         "SIMD_SOURCES",
+        "CUT_SOURCES",
         "SOURCES",
+        "C_SOURCES",
         "BINDINGS",
         "CUDA_BINDINGS",
         "CUDA_DECISION_SOURCES",
@@ -222,7 +237,14 @@ def test_host_sources_know_nothing_of_the_cuda_runtime():
     )
     todo = {
         CSRC.parent / s
-        for n in ("V3DG_SIMD_SOURCES", "V3DG_SOURCES", "V3DG_BINDINGS")
+        for n in (
+            "V3DG_CUT_SIMD_SOURCES",
+            "V3DG_SIMD_SOURCES",
+            "V3DG_CUT_SOURCES",
+            "V3DG_SOURCES",
+            "V3DG_C_SOURCES",
+            "V3DG_BINDINGS",
+        )
         for s in cmake_list(n)
     }
     seen = set()

@@ -147,6 +147,24 @@ def test_the_finest_level_of_an_export_loads(tmp_path, bundle):
     )
 
 
+def test_the_folder_of_an_export_is_an_asset(tmp_path, bundle):
+    """As its index is, in Python and in commands, which name it after the folder."""
+    write_streamed_sog(bundle, tmp_path / "web", chunk=250)
+    loaded = v3dg.read_asset(tmp_path / "web")
+    wanted = v3dg.read_asset(tmp_path / "web" / "lod-meta.json")
+    np.testing.assert_array_equal(loaded.means, wanted.means)
+    assert asset_bytes(tmp_path / "web") == asset_bytes(tmp_path / "web" / "lod-meta.json")
+    done = run("render", "web", "--size", "16", "16", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "web.png").is_file()
+    done = run("build", "web", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "web.v3dg").is_file()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="expected a file name that ends in"):
+        v3dg.read_asset(tmp_path / "empty")
+
+
 def edited(tmp_path, bundle, **changes):
     """Return the index of an export with other values at the top, or in the finest
     level of its first leaf."""

@@ -23,7 +23,7 @@ from test_ply import (
     random_gaussians,
 )
 from v3dg import write_asset
-from v3dg.io import open_asset
+from v3dg.io import asset_bytes, open_asset
 
 SH_C0 = 0.28209479177387814
 NORMALS = ["nx", "ny", "nz"]
@@ -361,12 +361,19 @@ def test_a_splat_that_begins_like_a_ksplat_is_a_splat(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.gz", "a", "a.bin"])
-def test_files_of_unknown_names_are_named_by_what_they_are(tmp_path, name):
+def test_files_of_unknown_names_are_read_by_their_content(tmp_path, name):
     shutil.copyfile(FIXTURES / "sh3.sog", tmp_path / name)
-    with pytest.raises(ValueError, match=r"this is a \.sog, so rename it to end in that$"):
-        read(tmp_path / name)
+    file = open_asset(tmp_path / name)
+    wanted = open_asset(FIXTURES / "sh3.sog")
+    note = "The end of its name is unknown; the file is a .sog and was read as such."
+    assert file.declared.notes == (note, *wanted.declared.notes)
+    np.testing.assert_array_equal(file.read(0, 10).means, wanted.read(0, 10).means)
+    assert asset_bytes(tmp_path / name) == (tmp_path / name).stat().st_size
     (tmp_path / name).write_bytes(gzip.compress(b"ply\nformat ascii 1.0\n"))
     with pytest.raises(ValueError, match=r"this is a gzip of a \.ply; unpack it$"):
+        read(tmp_path / name)
+    (tmp_path / name).write_bytes(b"PXR-USDC" + bytes(100))
+    with pytest.raises(ValueError, match=r"this is a \.usdc, so rename it to end in that$"):
         read(tmp_path / name)
 
 

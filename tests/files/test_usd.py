@@ -15,6 +15,7 @@ from command_line import run
 from half_turns import half_turn
 from random_bundle import random_bundle, random_gaussians
 from v3dg.export import write_usd
+from v3dg.formats._packing import SH_C0
 from v3dg.io import open_asset
 
 pytest.importorskip("pxr")
@@ -45,6 +46,38 @@ def test_an_asset_reads_back(tmp_path, suffix, degree):
     assert os.listdir(tmp_path) == [f"a.{suffix}"]
     if suffix == "usda":
         assert (tmp_path / "a.usda").read_text().startswith("#usda 1.0")
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_coefficients_say_how_many_belong_to_a_gaussian(tmp_path, degree):
+    """Requirement VG.035 of NVIDIA's usd-validation: interpolation `vertex`, and an
+    elementSize of the degree's number of coefficients."""
+    path = tmp_path / "a.usdc"
+    v3dg.write_asset(path, random_gaussians(np.random.default_rng(0), 5, degree))
+    stage = Usd.Stage.Open(os.fspath(path))
+    prim = stage.GetDefaultPrim()
+    harmonics = UsdGeom.Primvar(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients"))
+    assert harmonics.GetInterpolation() == "vertex"
+    assert harmonics.GetElementSize() == (degree + 1) ** 2
+
+
+@pytest.mark.witness
+@pytest.mark.parametrize("name", ["asset.usdc", "asset.usdz", "scene.usda"])
+def test_nvidias_rules_find_nothing(tmp_path, name):
+    """Those of usd-validation-nvidia that it has on, but for its advice to store large
+    arrays in binary files; and the rule for splats."""
+    nvidia = pytest.importorskip("usd_validation_nvidia")
+    generator = np.random.default_rng(0)
+    if name == "scene.usda":
+        scene = v3dg.Scene()
+        scene.add(random_bundle(generator), positions=[[0, 0, 0], [3, 0, 0]])
+        write_usd(scene, tmp_path / name)
+    else:
+        v3dg.write_asset(tmp_path / name, random_gaussians(generator, 50, 3))
+    engine = nvidia.ValidationEngine()
+    engine.enable_rule(nvidia.GaussianSplatSchemaChecker)
+    found = [str(issue) for issue in engine.validate(os.fspath(tmp_path / name)).issues()]
+    assert [text for text in found if "UsdAsciiPerformanceChecker" not in text] == []
 
 
 def test_no_gaussians_are_written(tmp_path):
@@ -479,6 +512,50 @@ def test_what_a_prim_says_besides_is_told(tmp_path):
         "The hint sortingModeHint is 'rayHitDistance' and was ignored.",
         "Attributes of gaussians were ignored: 'velocities'.",
     ]
+
+
+def stage_with_color_space(path, asset, name, place):
+    """A stage whose coefficients are in the colour space `name`, which `place`
+    declares."""
+    stage = new_stage(path)
+    world = UsdGeom.Xform.Define(stage, "/world").GetPrim()
+    prim = v3dg.formats.usd.define(stage, "/world/a", half_turn(asset, "x"))
+    prim.RemoveProperty("colorSpace:name")
+    if place == "attribute":
+        prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").SetColorSpace(name)
+    else:
+        declaring = {"prim": prim, "parent": world}[place]
+        Usd.ColorSpaceAPI.Apply(declaring).CreateColorSpaceNameAttr(name)
+    stage.GetRootLayer().Save()
+
+
+@pytest.mark.parametrize("place", ["attribute", "prim", "parent"])
+@pytest.mark.parametrize("name", ["lin_rec709_scene", "srgb_rec709_scene", "lin_ap1_scene"])
+def test_the_colour_space_of_coefficients_counts(tmp_path, name, place):
+    """Whatever declares it. Linear grey of 0.2 is 0.4845 in sRGB (IEC 61966-2-1)."""
+    asset = random_gaussians(np.random.default_rng(0), 3, 1)
+    asset.sh[:] = 0
+    asset.sh[:, 0] = (0.2 - 0.5) / SH_C0
+    stage_with_color_space(tmp_path / "a.usda", asset, name, place)
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    expected = 0.2
+    words = []
+    if name == "lin_rec709_scene":
+        expected = 0.4845
+        words = ["linear (lin_rec709_scene)"]
+    elif name == "lin_ap1_scene":
+        words = ["'lin_ap1_scene' was read as sRGB"]
+    np.testing.assert_allclose(found.sh[:, 0] * SH_C0 + 0.5, expected, atol=1e-4)
+    np.testing.assert_allclose(found.sh[:, 1:], 0, atol=1e-4)
+    assert len(notes) == len(words)
+    assert all(word in note for word, note in zip(words, notes, strict=True))
+
+
+def test_written_coefficients_declare_their_colour_space(tmp_path):
+    v3dg.write_asset(tmp_path / "a.usda", random_gaussians(np.random.default_rng(0), 3, 1))
+    stage = Usd.Stage.Open(os.fspath(tmp_path / "a.usda"))
+    prim = stage.GetPrimAtPath("/gaussians")
+    assert Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr().Get() == "srgb_rec709_scene"
 
 
 @pytest.mark.parametrize(

@@ -97,9 +97,7 @@ def test_what_cannot_be_meant_is_told(folder):
         "x.ply",
         cwd=folder,
     )
-    fails(
-        1, "a file ending in .v3dg, got another suffix", "refine", "donut.ply", "x.v3dg", cwd=folder
-    )
+    fails(1, "a file ending in .v3dg, got a .ply", "refine", "donut.ply", "x.v3dg", cwd=folder)
     fails(1, "Not a directory", "refine", "donut.v3dg", "donut.v3dg/x.v3dg", cwd=folder)
     fails(
         1,
