@@ -40,10 +40,11 @@ struct NextRun {
 // The window is empty or inside the camera's image. Unless `source` is null, source[r]
 // becomes `source_base` plus the index, relative to `skip`, of the gaussian of record
 // r. `next` changes no result.
-V3DG_DECLARE_PER_ISA(template <class T> size_t project(
-    const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrinsics<T>& camera,
-    const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base, Reach& reach,
-    const NextRun<T>& next = {}))
+V3DG_DECLARE_PER_ISA(template <class T> size_t project(const Draw<T>& draw, uint64_t skip,
+                                                       uint64_t count, const Intrinsics<T>& camera,
+                                                       const Window& window, Record<T>* records,
+                                                       uint32_t* source, uint32_t source_base,
+                                                       Reach& reach, const NextRun<T>& next = {}))
 
 // Computes the gradients of gaussians from the gradients of their records. The index of
 // record r's gaussian in the draw is source[r].

@@ -29,8 +29,8 @@ struct PlaneSource {
     const NextRun<T>& next;
 
     // Requests gaussians that are read soon, while row i of a run is projected. The run
-    // has `left` rows from row i on. Clusters are short, and a processor recognises only
-    // a few of the many planes as streams.
+    // has `left` rows from row i on. Clusters are short, and a processor recognises
+    // only a few of the many planes as streams.
     V3DG_INLINE void prefetch(uint64_t i, uint64_t left) const {
         constexpr uint64_t kRowsAhead = 64;
         if (left > kRowsAhead)
@@ -244,8 +244,8 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrins
             if (draw.codes != nullptr)
                 return project_codes(draw, skip, count, model, window, records, source, source_base,
                                      reach);
-        return project_rows(PlaneSource<T>{*draw.model, next}, draw, draw.first + skip, count, model,
-                            window, records, source, source_base, reach);
+        return project_rows(PlaneSource<T>{*draw.model, next}, draw, draw.first + skip, count,
+                            model, window, records, source, source_base, reach);
     });
 }
 

@@ -97,8 +97,8 @@ template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out);
 
-// Appends the records from `first` on to the lists of their tiles. Precondition: `first`
-// + `count` is at most kMostChunkRecords.
+// Appends records [first, first + count) to the lists of their tiles. Precondition:
+// `first` + `count` is at most kMostChunkRecords.
 template <class T>
 void append_records(const Record<T>* records, uint32_t first, uint32_t count, const TileGrid& grid,
                     GrowingLists& out);

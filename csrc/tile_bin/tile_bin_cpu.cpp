@@ -193,8 +193,8 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
     least = least >> depth_shift << depth_shift;
     const int bits = static_cast<int>(std::bit_width((most - least) >> depth_shift));
     if (bits == 0) return;
-    // A radix sort of two digits, which contain only bits that differ after the smallest
-    // depth is subtracted. If they are not all bits, few neighbours are out of order.
+    // A radix sort of two digits, which contain only bits that differ after the
+    // smallest depth is subtracted. If bits are left, few neighbours are out of order.
     const int sorted_bits = std::min(bits, 2 * digit_bits_of(count));
     const int key_shift = depth_shift + bits - sorted_bits;
     const int low_bits = sorted_bits / 2;
