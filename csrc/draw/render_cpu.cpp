@@ -116,6 +116,23 @@ class RecordRoom {
     std::vector<Strip> mine_;
 };
 
+// Returns the gaussians that are projected after piece p, up to piece `last`.
+template <class T>
+static NextRun<T> run_after(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
+                            size_t p, size_t last) {
+    if (p + 1 >= last) return {};
+    const Draw<T>& draw = draws[pieces[p + 1].draw];
+    return {.model = draw.codes == nullptr ? draw.model : nullptr,
+            .first = draw.first + pieces[p + 1].skip};
+}
+
+// Returns whether loops of this thread are not divided among threads.
+static bool runs_alone() { return most_threads() == 1 || omp_in_parallel() != 0; }
+
+static uint64_t num_gaussians_of(const std::vector<Piece>& pieces) {
+    return pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
+}
+
 // Returns the tiles in falling order of the length of their lists, so that no thread
 // starts a long list at the end.
 static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_tiles) {
@@ -217,7 +234,8 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
             count += V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count,
                                        camera, window, records + first + count,
                                        keep_source ? source + first + count : nullptr,
-                                       static_cast<uint32_t>(piece.first), reach);
+                                       static_cast<uint32_t>(piece.first), reach,
+                                       run_after(draws, pieces, p, chunks[c].last));
             piece.reach = reach;
         }
         if (is_stopped(stop)) return;
@@ -251,6 +269,40 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     counts.project_seconds += projected - start;
     counts.bin_seconds += binned - projected;
     counts.rasterize_seconds += now() - binned;
+}
+
+// Draws a picture of at most kMostChunkRecords gaussians on one thread, so that records
+// are in one sequence, and entries go straight to the lists of their tiles.
+template <class T>
+static void render_alone(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
+                         const Intrinsics<T>& camera, const Picture<T>& picture, Workspace<T>& ws,
+                         const std::atomic<bool>* stop, RenderCounts& counts) {
+    const double start = now();
+    const TileGrid grid(picture.window);
+    ws.room = num_gaussians_of(pieces);
+    ws.most_room = std::max(ws.most_room, ws.room);
+    Record<T>* records = ws.records.reserve(ws.room);
+    ws.growing.start(grid);
+    uint32_t num_records = 0;
+    for (size_t p = 0; p < pieces.size() && !is_stopped(stop); ++p) {
+        Piece& piece = pieces[p];
+        const auto count = static_cast<uint32_t>(
+            V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count, camera,
+                              picture.window, records + num_records, nullptr, 0, piece.reach,
+                              run_after(draws, pieces, p, pieces.size())));
+        append_records(records, num_records, count, grid, ws.growing);
+        num_records += count;
+    }
+    const double projected = now();
+    for (size_t t = 0; t < grid.size() && !is_stopped(stop); ++t) {
+        const GrowingLists::List& list = ws.growing.list[t];
+        sort_tile(records, kChunkFormat, list.data(), list.size(), ws.scratch.reserve(list.size()));
+        V3DG_DISPATCH_ISA(rasterize_tile<T>, records, kChunkFormat, list.data(), list.size(),
+                          kTileSize * grid.column(t), kTileSize * grid.row(t), picture);
+        counts.entries += list.size();
+    }
+    counts.project_seconds += projected - start;
+    counts.rasterize_seconds += now() - projected;
 }
 
 // Returns the part of a picture that is in a band.
@@ -288,7 +340,10 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Intrinsics<T>& came
     const std::vector<Window> bands = keep_source
                                           ? std::vector<Window>{picture.window}
                                           : bands_of(draws, pieces, camera, picture.window, stop);
-    for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b) {
+    const bool is_alone = !keep_source && sensor == nullptr && bands.size() == 1 && runs_alone() &&
+                          num_gaussians_of(pieces) <= kMostChunkRecords;
+    if (is_alone) render_alone(draws, pieces, camera, picture, ws, stop, counts);
+    for (size_t b = 0; b < bands.size() && !is_alone && !is_stopped(stop); ++b) {
         render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), needs_source, ws,
                     stop, counts);
         if constexpr (std::is_same_v<T, float>)
