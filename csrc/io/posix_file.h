@@ -39,11 +39,9 @@ class PosixFile {
         if (descriptor_ >= 0) ::close(descriptor_);
     }
 
-    struct stat status() const {
-        struct stat status = {};
-        check(::fstat(descriptor_, &status));
-        return status;
-    }
+    size_t size() const { return static_cast<size_t>(status().st_size); }
+    bool is_folder() const { return S_ISDIR(status().st_mode); }
+    bool is_regular() const { return S_ISREG(status().st_mode); }
 
     // Returns the number of bytes that were read: less than `size` only at the end of
     // the file.
@@ -102,6 +100,11 @@ class PosixFile {
 
   private:
     explicit PosixFile(int descriptor) : descriptor_(descriptor) { check(descriptor); }
+    struct stat status() const {
+        struct stat status = {};
+        check(::fstat(descriptor_, &status));
+        return status;
+    }
     static void check(ssize_t result) {
         if (result < 0) throw std::system_error(errno, std::generic_category());
     }
