@@ -73,7 +73,7 @@ class PosixFile {
 
     // Asks the system to start reading a part of the file. Some systems ignore the
     // request.
-    void expect(size_t offset, size_t size) const {
+    void expect([[maybe_unused]] size_t offset, [[maybe_unused]] size_t size) const {
 #ifdef POSIX_FADV_WILLNEED
         static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset),
                                           static_cast<off_t>(size), POSIX_FADV_WILLNEED));
