@@ -18,9 +18,8 @@ set(CMAKE_CXX_COMPILER ${V3DG_ZIG_PYTHON} -m ziglang c++ -target ${V3DG_ZIG_TARG
 set(V3DG_X86_64_LEVEL x86_64_v)
 # zig would trap undefined behaviour where nothing is optimised.
 set(CMAKE_CXX_FLAGS_INIT "-fno-sanitize=undefined")
-# In zig 0.17, <cfloat> is empty for macOS if a header that needs infinity comes first.
 if(CMAKE_SYSTEM_NAME STREQUAL "Darwin")
-    string(APPEND CMAKE_CXX_FLAGS_INIT " -include cfloat")
+    string(APPEND CMAKE_CXX_FLAGS_INIT " -include ${CMAKE_CURRENT_LIST_DIR}/zig_macos.h")
 endif()
 # zig links each system's own libraries; those of this machine are none of them.
 set(CMAKE_FIND_ROOT_PATH_MODE_LIBRARY ONLY)
