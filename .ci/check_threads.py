@@ -77,7 +77,7 @@ def cuda_headers() -> Path | None:
 
 
 def include_options(csrc: Path) -> list[str]:
-    options = ["-I", str(csrc)]
+    options = ["-I", str(csrc), "-I", str(CSRC.parent / "include")]
     if importlib.util.find_spec("pybind11") is not None:
         import pybind11
 
@@ -85,11 +85,12 @@ def include_options(csrc: Path) -> list[str]:
         options += ["-isystem", sysconfig.get_path("include")]
     if (cuda := cuda_headers()) is not None:
         options += ["-isystem", str(cuda)]
-    # Clang has a header of OpenMP only with libomp-dev; the one of gcc suffices here.
+    # Clang has a header of OpenMP only with libomp-dev. Otherwise GCC's header suffices,
+    # without an attribute with an argument that Clang does not know.
     if compiler := shutil.which("g++"):
         command = [compiler, "-print-file-name=include"]
         folder = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-        options += ["-idirafter", folder]
+        options += ["-idirafter", folder, "-D__malloc__(function)="]
     return options
 
 

@@ -131,6 +131,7 @@ class ResidentScene:
                 scales,
                 scene.factors,
                 scene.environments,
+                scene.labels,
             )
         self.revision = scene.revision
 

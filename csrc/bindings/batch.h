@@ -7,6 +7,7 @@
 
 #include "bindings/array.h"
 #include "bindings/drawing.h"
+#include "bindings/sensor.h"
 #include "frame/image.h"
 
 namespace v3dg {
@@ -104,6 +105,7 @@ class BoundBatch {
     }
 
     py::object color, alpha, depth;  // as in BoundPlanes
+    NewChannels channels;
 
   private:
     py::object kept_;  // destroyed after the members of a derived class

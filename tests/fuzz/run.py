@@ -1,30 +1,43 @@
-"""Fuzz the .ply reader, which is C++, for some time, and keep the inputs that reach all
-it reached.
+"""Fuzz the .ply reader or the C library, which are C++, for some time, and keep the
+inputs that reach all that was reached.
 
-    python tests/fuzz/run.py SECONDS
+    python tests/fuzz/run.py SECONDS [ply | c_library]
 
-It is guided by coverage and needs clang++ (CLANG names another one). It works in
-build/fuzz; what stops it is there as crash-*. Inputs go to tests/fuzz/corpus, which
-attack/test_fuzz.py replays. What is not C++ is attack.py's.
+It is guided by coverage and needs clang++ (CLANG names another one), and for the C
+library nlohmann/json.hpp. It works in build/fuzz; what stops it is there as crash-*.
+Inputs go to tests/fuzz/corpus, which attack/test_fuzz.py and, for the C library,
+unit/c_interface/test_c_files.py replay. What is not C++ is attack.py's.
 """
 
+import argparse
 import os
+import re
+import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "files"))
 
 
 import numpy as np
 
+import c_library
 from test_ply import HOSTILE, Element, ply_bytes, random_columns
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-MAX_BYTES, KEPT_BYTES = 8192, 1000
-LARGEST_SEED = 10_000  # bytes; a few of the broken files are made to be large
+GOLDEN = HERE.parent / "golden"
+CHECKS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined"]
+PLY_SOURCES = {
+    "threads.cpp",
+    *(f"ply_{n}.cpp" for n in ("fields", "header", "read", "rows", "text")),
+}
+MAX_BYTES = {"ply": 8192, "c_library": 16384}
+KEPT_BYTES = {"ply": 1000, "c_library": 12000}
+LARGEST_SEED = 10_000  # bytes; a few of the broken files are made large
 
 
 def ply_seeds():
@@ -40,19 +53,46 @@ def ply_seeds():
     yield from (content for content, _ in HOSTILE.values() if len(content) <= LARGEST_SEED)
 
 
-def compiled(folder):
-    sources = [
-        HERE / "fuzz_ply.cpp",
-        ROOT / "csrc/base/threads.cpp",
-        *(
-            ROOT / "csrc/io" / f"ply_{part}.cpp"
-            for part in ("fields", "header", "read", "rows", "text")
-        ),
-    ]
-    checks = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined"]
-    program = folder / "fuzz_ply"
+def c_library_seeds():
+    """Bundles of all versions, and what the fuzzers of the Python readers kept."""
+    yield from (path.read_bytes() for path in sorted(GOLDEN.glob("*.v3dg")))
+    for name in ("bundle", "scene"):
+        with zipfile.ZipFile(HERE / "corpus" / f"{name}.zip") as archive:
+            yield from map(archive.read, archive.namelist())
+
+
+def cmake_sources(*names):
+    """Return the sources in lists of CMakeLists.txt."""
+    text = (ROOT / "CMakeLists.txt").read_text(encoding="utf-8")
+    for name in names:
+        yield from (ROOT / path for path in re.search(rf"set\({name}\s([^)]*)\)", text)[1].split())
+
+
+def c_library_sources(folder):
+    """Sources of the C library. Those that are compiled once for each instruction set
+    are all compiled for the plain one here."""
+    yield from cmake_sources("V3DG_CUT_SOURCES", "V3DG_C_SOURCES")
+    for isa in ("baseline", "avx2", "avx512"):
+        for source in cmake_sources("V3DG_CUT_SIMD_SOURCES"):
+            wrapped = folder / f"{source.stem}_{isa}.cpp"
+            wrapped.write_text(f'#define V3DG_ISA isa_{isa}\n#include "{source}"\n')
+            yield wrapped
+
+
+def compiled(folder, target="ply"):
+    """Compile the fuzzer of a target and return its path."""
+    options = ["-std=c++20", "-g", "-O1", *CHECKS, "-fopenmp", "-I", str(ROOT / "csrc")]
+    if target == "ply":
+        sources = [*cmake_sources("V3DG_SOURCES"), ROOT / "csrc" / "base" / "threads.cpp"]
+        sources = [path for path in sources if path.name in PLY_SOURCES]
+    else:
+        sources = list(c_library_sources(folder))
+        options += ["-I", str(ROOT / "include"), "-ffp-contract=off", "-pthread"]
+        if c_library.json_folder() is not None:
+            options += ["-isystem", str(c_library.json_folder())]
+    program = folder / f"fuzz_{target}"
+    sources.append(HERE / f"fuzz_{target}.cpp")
     compiler = os.environ.get("CLANG", "clang++")
-    options = ["-std=c++20", "-g", "-O1", *checks, "-fopenmp", "-I", str(ROOT / "csrc")]
     subprocess.run([compiler, *options, *map(str, sources), "-o", str(program)], check=True)
     return str(program)
 
@@ -66,38 +106,49 @@ def keep(corpus, archive, max_bytes):
 
 
 def main():
-    (seconds,) = sys.argv[1:]
-    folder = ROOT / "build" / "fuzz" / "ply"
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser.add_argument("seconds", type=int)
+    parser.add_argument("target", nargs="?", default="ply", choices=SEEDS)
+    options = parser.parse_args()
+    target = options.target
+    folder = ROOT / "build" / "fuzz" / target
     seeds, found, kept = (folder / name for name in ("seeds", "found", "kept"))
     for path in (seeds, found, kept):
         path.mkdir(parents=True, exist_ok=True)
-    for i, content in enumerate(ply_seeds()):
+    for i, content in enumerate(SEEDS[target]()):
         (seeds / f"seed_{i:02}").write_bytes(content)
-    archive = HERE / "corpus" / "ply.zip"
-    zipfile.ZipFile(archive).extractall(found)
+    archive = HERE / "corpus" / f"{target}.zip"
+    if archive.exists():
+        zipfile.ZipFile(archive).extractall(found)
+    shutil.copy(GOLDEN / "bundle_3_quantized.v3dg", folder / "a.v3dg")  # of scenes
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    program = compiled(folder)
-    options = [
+    program = compiled(folder, target)
+    command = [
+        program,
         "-timeout=30",
         "-print_final_stats=1",
-        f"-max_len={MAX_BYTES}",
-        f"-max_total_time={seconds}",
+        f"-max_len={MAX_BYTES[target]}",
+        f"-max_total_time={options.seconds}",
+        f"-dict={HERE / f'{target}.dict'}",
+        str(found),
+        str(seeds),
     ]
-    start = [program, *options, f"-dict={HERE / 'ply.dict'}", str(found), str(seeds)]
-    subprocess.run(start, cwd=folder, env=environment, check=True)
+    subprocess.run(command, cwd=folder, env=environment, check=True)
     for path in kept.iterdir():
         path.unlink()
     merge = [
         program,
         "-set_cover_merge=1",
-        f"-max_len={KEPT_BYTES}",
+        f"-max_len={KEPT_BYTES[target]}",
         str(kept),
         str(found),
         str(seeds),
     ]
     subprocess.run(merge, cwd=folder, env=environment, check=True)
-    keep(kept, archive, KEPT_BYTES)
+    keep(kept, archive, KEPT_BYTES[target])
 
+
+SEEDS = {"ply": ply_seeds, "c_library": c_library_seeds}
 
 if __name__ == "__main__":
     main()

@@ -1,0 +1,55 @@
+#pragma once
+
+// JSON values, and the parser of strict JSON.
+
+#include <cstdint>
+#include <string>
+#include <string_view>
+#include <variant>
+#include <vector>
+
+namespace v3dg {
+
+// A JSON value. Whole numbers that an int64_t cannot hold are doubles.
+class Json {
+  public:
+    struct Member;
+    using Array = std::vector<Json>;
+    using Object = std::vector<Member>;  // in the order of the text
+
+    std::variant<std::nullptr_t, bool, int64_t, double, std::string, Array, Object> value;
+
+    template <class T>
+    const T* get() const {
+        return std::get_if<T>(&value);
+    }
+    // Returns the member of an object with this key; null if there is none, or if the
+    // value is no object.
+    const Json* find(std::string_view key) const;
+};
+
+struct Json::Member {
+    std::string key;
+    Json value;
+};
+
+// Parses JSON in UTF-8, with or without a byte order mark. Throws std::invalid_argument
+// for anything else, for keys that occur twice in an object, and for deep nesting.
+Json parse_json(std::string_view text);
+
+// Returns a value as short text for a message of one line. The overload for null says
+// that there is no value.
+std::string json_text(const Json& value);
+std::string json_text(const Json* value);
+
+// Returns text of at most 60 characters; longer text ends in three dots.
+std::string shortened(const std::string& text);
+
+// Returns a string in quotation marks, with escape sequences and ASCII alone.
+std::string quoted(const std::string& text);
+
+// Returns whether UTF-8 fits in one line of a message: it has no control characters and
+// no separators of lines.
+bool is_one_line(std::string_view text);
+
+}  // namespace v3dg

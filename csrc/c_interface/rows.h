@@ -1,0 +1,18 @@
+#pragma once
+
+// Gaussians in the memory of the caller.
+
+#include <string>
+
+#include <v3dg.h>
+#include "math/gaussian.h"
+
+namespace v3dg {
+
+// Throws Fault unless the caller's arrays have room for this many gaussians.
+void check_room(const v3dg_gaussians& out, uint64_t num_gaussians);
+
+// Copies gaussians to the caller's arrays, from row `first` on.
+void copy_rows(const GaussianRows<const float>& rows, const v3dg_gaussians& out, size_t first);
+
+}  // namespace v3dg

@@ -1,0 +1,53 @@
+#pragma once
+
+// Scenes: bundles, instances, cameras, and which pages are resident.
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include <v3dg.h>
+#include "c_interface/bundle.h"
+#include "residency/instance_table.h"
+
+namespace v3dg {
+
+using SharedBundle = std::shared_ptr<const OpenBundle>;
+
+struct NamedCamera {
+    std::string name;
+    v3dg_camera camera;
+};
+
+// The content of a scene's file. All values are checked; quaternions have length one.
+struct SceneContent {
+    std::vector<SharedBundle> bundles;  // in the order of their first instances
+    std::vector<v3dg_instance> instances;
+    std::vector<NamedCamera> cameras;
+    std::string up;  // the axis that is up, or empty
+};
+
+// The instances of a scene as the core reads them.
+class InstanceColumns {
+  public:
+    InstanceColumns() = default;
+    explicit InstanceColumns(const std::vector<v3dg_instance>& instances);
+    InstanceTable table() const;
+
+  private:
+    std::vector<int32_t> bundle_;
+    std::vector<double> position_, quaternion_, scale_;
+    std::vector<float> importance_;
+    std::vector<InstanceFactors> factors_;  // empty if all are 1
+};
+
+}  // namespace v3dg
+
+struct v3dg_scene {
+    v3dg::SceneContent content;
+    v3dg::InstanceColumns columns;
+    // For each bundle: 0 for resident pages, v3dg::kAbsentPage for others; empty if all
+    // are resident.
+    std::vector<std::vector<int64_t>> page_shift;
+    uint64_t revision = 0;  // of the instances; no other scene has the same
+};
