@@ -1,11 +1,8 @@
 // Draws pictures on the CPU, and computes gradients: the gaussians are projected and
 // binned in parallel pieces, and tiles are blended in parallel.
 
-#include "base/threads.h"
 #include "draw/render.h"
 #include "draw/sense.h"
-
-#include <omp.h>
 
 #include <algorithm>
 #include <atomic>
@@ -96,13 +93,13 @@ class RecordRoom {
     uint64_t used() const { return used_; }
     // Returns the index of the first record of this thread's next chunk.
     uint64_t take() {
-        Strip& mine = mine_[omp_get_thread_num()];
+        Strip& mine = mine_[thread_index()];
         if (mine.left < longest_)
             mine = {used_.fetch_add(strip_, std::memory_order_relaxed), strip_};
         return mine.next;
     }
     void keep(uint64_t count) {
-        Strip& mine = mine_[omp_get_thread_num()];
+        Strip& mine = mine_[thread_index()];
         mine.next += count;
         mine.left -= count;
     }
@@ -151,7 +148,7 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
-    if (stop != nullptr || omp_in_parallel() != 0) return kLeastBandBytes;
+    if (stop != nullptr || is_in_parallel()) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
 // Pictures with at most this many gaussians are drawn in a single band, because they
@@ -260,8 +257,7 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
         const uint32_t t = order[i];
         uint64_t* entry = ws.lists.entry.data() + offset[t];
         const size_t count = offset[t + 1] - offset[t];
-        sort_tile(records, ws.lists.format, entry, count,
-                  scratch[omp_get_thread_num()].reserve(count));
+        sort_tile(records, ws.lists.format, entry, count, scratch[thread_index()].reserve(count));
         V3DG_DISPATCH_ISA(rasterize_tile<T>, records, ws.lists.format, entry, count,
                           kTileSize * grid.column(t), kTileSize * grid.row(t), picture);
     });
@@ -392,9 +388,9 @@ void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Pic
         const uint32_t t = order[i];
         const size_t count = offset[t + 1] - offset[t];
         const int column = grid.column(t), row = grid.row(t);
-        std::vector<RecordGradient<T>>& d_entry = d_entries[omp_get_thread_num()];
+        std::vector<RecordGradient<T>>& d_entry = d_entries[thread_index()];
         d_entry.assign(count, RecordGradient<T>{});
-        std::vector<CenterSize<T>>& size = sizes[omp_get_thread_num()];
+        std::vector<CenterSize<T>>& size = sizes[thread_index()];
         size.assign(with_size ? count : 0, CenterSize<T>{});
         V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, ws.lists.format, entry + offset[t],
                           count, kTileSize * column, kTileSize * row, picture, d_picture,
