@@ -77,6 +77,7 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_pool(m);
     v3dg::bind_batch(m);
     v3dg::bind_frame(m);
+    v3dg::bind_rays(m);
     v3dg::bind_fit_level(m);
     v3dg::bind_first_selected(m);
     refuse_unmade_objects(m);

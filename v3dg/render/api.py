@@ -8,24 +8,26 @@ from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, one_of, vector, whole
+from v3dg._numbers import check, color, one_of, vector, whole
 from v3dg.camera_batch import CameraBatch
 from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
-from v3dg.image import RenderedImage
+from v3dg.image import Image, RenderedImage
 from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
+from v3dg.render.rays import check_rays_device, draw_sphere
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
+from v3dg.spherical import EquirectangularCamera
 from v3dg.upright import direction_of, up_of
 
 if TYPE_CHECKING:
@@ -57,11 +59,15 @@ def render(
 ) -> tuple[RenderedImage, RenderedImage]: ...
 @overload
 def render(
+    subject: Subject | File, camera: EquirectangularCamera, **options: Unpack[_Options]
+) -> Image: ...
+@overload
+def render(
     subject: Subject | File, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[RenderedImage]: ...
 def render(
     subject: Subject | File,
-    camera: Camera | StereoCamera | Sequence[Camera] | None = None,
+    camera: Camera | StereoCamera | EquirectangularCamera | Sequence[Camera] | None = None,
     *,
     tolerance: float | None = None,
     budget: int | None = None,
@@ -74,7 +80,7 @@ def render(
     depth: bool = False,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
-) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
+) -> Image | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
@@ -93,7 +99,9 @@ def render(
             The two eyes of a stereo camera share one cut and one frame. Their two
             pictures have common statistics, which are sums, except for the number of
             selected gaussians. None means the first camera of a scene's file, else the
-            camera of `first_camera`.
+            camera of `first_camera`. An `EquirectangularCamera` is drawn on the CPU
+            with all gaussians resident, without statistics, and takes neither
+            `budget`, `cut` nor `min_transmittance`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -122,12 +130,21 @@ def render(
             the budget; on CUDA the latter is raised when the picture is used.
         RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
     """
-    chosen_device = _device.resolve(device)
     if camera is None:
         opened_subject, camera = _with_first_camera(subject)
     else:
         opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
+    if isinstance(camera, EquirectangularCamera):
+        refused = {"cut": cut, "min_transmittance": min_transmittance}
+        for name, value in refused.items():
+            check(name, value is None, "none for an equirectangular camera, got one; leave it out")
+        check("color_by", color_by == "appearance", f"'appearance' for rays, got {color_by!r}")
+        check_rays_device(device)
+        sphere_cut = CutRequest(tolerance, budget, min_level, fade)
+        behind = color(background, "background")
+        return draw_sphere(opened_subject, camera, sphere_cut, behind, depth=depth)
+    chosen_device = _device.resolve(device)
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
     is_asset = isinstance(opened_subject, Gaussians)
