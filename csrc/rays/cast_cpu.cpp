@@ -56,18 +56,6 @@ std::vector<float> padded(Span<const double> angles, size_t size, double (*funct
 
 size_t whole_tiles(size_t count, size_t tile) { return (count + tile - 1) / tile * tile; }
 
-// Returns the index of the first angle that is not below `value`.
-int32_t first_from(const std::vector<float>& angles, float value) {
-    return static_cast<int32_t>(std::lower_bound(angles.begin(), angles.end(), value) -
-                                angles.begin());
-}
-// Returns the index of the last angle that is not above `value`, or -1.
-int32_t last_up_to(const std::vector<float>& angles, float value) {
-    return static_cast<int32_t>(std::upper_bound(angles.begin(), angles.end(), value) -
-                                angles.begin()) -
-           1;
-}
-
 // The records of all chunks, in the order of the draws.
 Buffer<RayRecord> join(const std::vector<std::vector<RayRecord>>& parts, size_t& size) {
     std::vector<size_t> first(parts.size() + 1, 0);
@@ -140,11 +128,38 @@ struct RayLists {
 
 }  // namespace
 
+AngleTable::AngleTable(Span<const double> angles)
+    : angles_(angles.begin(), angles.end()), first_in_bucket_(angles.size + 1) {
+    const float span = angles_.back() - angles_.front();
+    buckets_per_radian_ = span > 0 ? static_cast<float>(angles.size) / span : 0;
+    size_t i = 0;
+    for (size_t bucket = 0; bucket < first_in_bucket_.size(); ++bucket) {
+        const float start =
+            angles_.front() + static_cast<float>(bucket) * (span / static_cast<float>(angles.size));
+        while (i + 1 < angles_.size() && angles_[i] < start) ++i;
+        first_in_bucket_[bucket] = static_cast<int32_t>(i);
+    }
+}
+
+int AngleTable::first_from(float value) const {
+    if (!(value > angles_.front())) return 0;
+    if (value > angles_.back()) return size();
+    const auto bucket = static_cast<size_t>((value - angles_.front()) * buckets_per_radian_);
+    int i = first_in_bucket_[std::min(bucket, first_in_bucket_.size() - 1)];
+    // Rounding may lead to a neighbouring bucket.
+    while (i > 0 && angles_[i - 1] >= value) --i;
+    while (angles_[i] < value) ++i;
+    return i;
+}
+
+int AngleTable::last_up_to(float value) const {
+    int i = first_from(value);
+    while (i < size() && angles_[i] <= value) ++i;
+    return i - 1;
+}
+
 RayGrid::RayGrid(Span<const double> azimuth, Span<const double> elevation)
-    : num_columns_(static_cast<int>(azimuth.size)),
-      num_rows_(static_cast<int>(elevation.size)),
-      azimuth_(azimuth.begin(), azimuth.end()),
-      elevation_(elevation.begin(), elevation.end()) {
+    : azimuth_(azimuth), elevation_(elevation) {
     const size_t columns = whole_tiles(azimuth.size, kRayTileColumns);
     const size_t rows = whole_tiles(elevation.size, kRayTileRows);
     azimuth_cosine_ = padded(azimuth, columns, std::cos);
@@ -153,21 +168,20 @@ RayGrid::RayGrid(Span<const double> azimuth, Span<const double> elevation)
     elevation_sine_ = padded(elevation, rows, std::sin);
 }
 
-RayGrid::Range RayGrid::range_of(const DirectionBox& box) const {
-    Range range{.row0 = first_from(elevation_, box.elevation0),
-                .row1 = last_up_to(elevation_, box.elevation1),
+RayGrid::Range RayGrid::range_of(const DirectionBox<float>& box) const {
+    Range range{.row0 = elevation_.first_from(box.elevation0),
+                .row1 = elevation_.last_up_to(box.elevation1),
                 .column0 = 0,
-                .column1 = num_columns_ - 1};
-    // NaN has all columns.
-    if (!(box.azimuth1 - box.azimuth0 < kTurn)) return range;
+                .column1 = num_columns() - 1};
+    if (range.row0 > range.row1 || !(box.azimuth1 - box.azimuth0 < kTurn)) return range;
     const float turns = std::floor(box.azimuth0 / kTurn) * kTurn;
     // The subtraction rounds, so the margin is once more added to its results.
     const float start = box.azimuth0 - turns - kDirectionMargin;
     const float end = box.azimuth1 - turns + kDirectionMargin;
-    range.column0 = first_from(azimuth_, start);
+    range.column0 = azimuth_.first_from(start);
     range.column1 =
-        end < kTurn ? last_up_to(azimuth_, end) : num_columns_ + last_up_to(azimuth_, end - kTurn);
-    range.column1 = std::min(range.column1, range.column0 + num_columns_ - 1);
+        end < kTurn ? azimuth_.last_up_to(end) : num_columns() + azimuth_.last_up_to(end - kTurn);
+    range.column1 = std::min(range.column1, range.column0 + num_columns() - 1);
     return range;
 }
 

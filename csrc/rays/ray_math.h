@@ -152,10 +152,11 @@ V3DG_HD V3DG_INLINE RayHit<V> hit_of(const RayShape<T>& shape, const V& x, const
     return {above * inverse, forward * inverse};
 }
 
-// A box of directions: azimuths around the z axis from `azimuth0` to `azimuth1` (which
-// may exceed a turn), and elevations from the xy plane, in radians.
+// A box of directions: azimuths around the z axis from `azimuth0` to `azimuth1`, and
+// elevations from the xy plane, in radians. Azimuths that span a turn are all.
+template <class V>
 struct DirectionBox {
-    float azimuth0, azimuth1, elevation0, elevation1;
+    V azimuth0, azimuth1, elevation0, elevation1;
 };
 
 // Margin of a DirectionBox for rounding, in radians and relative to its half size.
@@ -168,72 +169,82 @@ constexpr float kDirectionMargin = 4e-6f, kRelativeDirectionMargin = 1e-4f;
 // conic. Its extent in e is where the line x = k touches it:
 //   k = (-c S_eu ± sqrt(c² S_eu² + c S_ee (1 - c S_uu))) / (1 - c S_uu), c = reach2,
 // with the covariance S, and likewise in n. If 1 - c S_uu is not positive, the ellipsoid
-// reaches beside the eye, and the box has all directions. Points of the box in the
-// plane have the horizontal distance cos - y sin from the z axis, along u, and x across
-// it, and the height sin + y cos, where sin and cos are those of u's elevation. If the
-// former reaches 0, the box contains a pole.
-V3DG_HD inline DirectionBox directions_of(const SeenGaussian<float>& seen, float reach2) {
-    const float pi = static_cast<float>(kPi);
-    const DirectionBox everything{-pi, 3 * pi, -pi, pi};
-    const float* u = seen.direction;
-    const float horizontal = sqrt_of(u[0] * u[0] + u[1] * u[1]);
-    const bool is_pole = horizontal < 1e-6f;
-    const float cosine = is_pole ? 1.0f : u[0] / horizontal;
-    const float sine = is_pole ? 0.0f : u[1] / horizontal;
-    const float east[3] = {-sine, cosine, 0.0f};
-    const float north[3] = {-u[2] * cosine, -u[2] * sine, horizontal};
-    float ee = 0, nn = 0, uu = 0, eu = 0, nu = 0;
+// reaches beside the eye, and the box has all directions.
+//
+// A point (x, y) of the plane has the distance cos - y sin from the z axis along u, x
+// across it, and the height sin + y cos, where sin and cos are those of u's elevation.
+// If the first of these reaches 0, the box contains a pole. Otherwise the azimuth
+// differs from that of u by at most |x| over the least of these distances, and the
+// elevation by y at most if x is 0. A point below the horizon rises with |x|: its
+// distance a from the axis grows by at most x² / 2a, and its elevation by at most |h| /
+// (h² + a²) times as much, where h is its height. The same holds above the horizon.
+template <class V>
+V3DG_HD V3DG_INLINE DirectionBox<V> directions_of(const SeenGaussian<V>& seen, const V& reach2) {
+    using T = Lane<V>;
+    const T turn = T(2 * kPi);
+    const V* u = seen.direction;
+    const V horizontal = sqrt_of(u[0] * u[0] + u[1] * u[1]);
+    const auto is_pole = horizontal < all_lanes<V>(T(1e-6));
+    const V cosine = is_pole ? all_lanes<V>(T(1)) : u[0] / horizontal;
+    const V sine = is_pole ? V{} : u[1] / horizontal;
+    const V east[3] = {-sine, cosine, V{}};
+    const V north[3] = {-u[2] * cosine, -u[2] * sine, horizontal};
+    V ee = V{}, nn = V{}, uu = V{}, eu = V{}, nu = V{};
     for (int k = 0; k < 3; ++k) {
-        const float e = seen.sigma[k] * dot3(seen.axis[k], east);
-        const float n = seen.sigma[k] * dot3(seen.axis[k], north);
-        const float along = seen.sigma[k] * dot3(seen.axis[k], u);
+        const V e = seen.sigma[k] * dot3(seen.axis[k], east);
+        const V n = seen.sigma[k] * dot3(seen.axis[k], north);
+        const V along = seen.sigma[k] * dot3(seen.axis[k], u);
         ee += e * e;
         nn += n * n;
         uu += along * along;
         eu += e * along;
         nu += n * along;
     }
-    const float rest = 1.0f - reach2 * uu;
-    if (!(rest > 1e-3f)) return everything;
-    const float scale = 1.0f / rest;
-    const float half_x = sqrt_of(reach2 * (reach2 * eu * eu + ee * rest)) * scale;
-    const float half_y = sqrt_of(reach2 * (reach2 * nu * nu + nn * rest)) * scale;
-    const float margin_x = kDirectionMargin + kRelativeDirectionMargin * half_x;
-    const float margin_y = kDirectionMargin + kRelativeDirectionMargin * half_y;
-    const float x0 = -reach2 * eu * scale - half_x - margin_x;
-    const float x1 = -reach2 * eu * scale + half_x + margin_x;
-    const float y0 = -reach2 * nu * scale - half_y - margin_y;
-    const float y1 = -reach2 * nu * scale + half_y + margin_y;
-    const float most_x = max_of(-x0, x1);
-    const float nearest_axis = min_of(horizontal - y0 * u[2], horizontal - y1 * u[2]);
-    const float latitude = atan2_of(u[2], horizontal);
-    if (!(nearest_axis > 1e-5f)) {
-        const float radius = atan2_of(sqrt_of(most_x * most_x + max_of(y0 * y0, y1 * y1)), 1.0f);
-        const float low = latitude - radius - kDirectionMargin;
-        const float high = latitude + radius + kDirectionMargin;
-        return {-pi, 3 * pi, u[2] > 0 ? low : -pi, u[2] > 0 ? pi : high};
-    }
-    const float high = u[2] + y1 * horizontal, low = u[2] + y0 * horizontal;
-    const float high_axis = horizontal - y1 * u[2], low_axis = horizontal - y0 * u[2];
-    const float beside = most_x * most_x;
-    const float high_across = high >= 0 ? high_axis : sqrt_of(high_axis * high_axis + beside);
-    const float low_across = low <= 0 ? low_axis : sqrt_of(low_axis * low_axis + beside);
-    const float longitude = atan2_of(sine, cosine);
-    return {.azimuth0 = longitude + atan2_of(x0, nearest_axis) - kDirectionMargin,
-            .azimuth1 = longitude + atan2_of(x1, nearest_axis) + kDirectionMargin,
-            .elevation0 = atan2_of(low, low_across) - kDirectionMargin,
-            .elevation1 = atan2_of(high, high_across) + kDirectionMargin};
+    const V rest = 1 - reach2 * uu;
+    const auto is_beside = rest <= all_lanes<V>(T(1e-3));
+    const V scale = 1 / rest;
+    const V half_x = sqrt_of(reach2 * (reach2 * eu * eu + ee * rest)) * scale;
+    const V half_y = sqrt_of(reach2 * (reach2 * nu * nu + nn * rest)) * scale;
+    const V margin_x = kDirectionMargin + kRelativeDirectionMargin * half_x;
+    const V margin_y = kDirectionMargin + kRelativeDirectionMargin * half_y;
+    const V x0 = -reach2 * eu * scale - half_x - margin_x;
+    const V x1 = -reach2 * eu * scale + half_x + margin_x;
+    const V y0 = -reach2 * nu * scale - half_y - margin_y;
+    const V y1 = -reach2 * nu * scale + half_y + margin_y;
+    const V most_x = max_of(-x0, x1), most_y = max_of(-y0, y1);
+    const V latitude = atan2_of(u[2], horizontal), longitude = atan2_of(sine, cosine);
+
+    const V low_axis = horizontal - y0 * u[2], high_axis = horizontal - y1 * u[2];
+    const V least_axis = min_of(low_axis, high_axis);
+    const auto has_pole = least_axis <= all_lanes<V>(T(1e-5));
+    const V low = u[2] + y0 * horizontal, high = u[2] + y1 * horizontal;
+    const V half_x2 = T(0.5) * most_x * most_x;
+    const V low_rise = max_of(low, V{}) * half_x2 / (low_axis * (low * low + low_axis * low_axis));
+    const V high_rise =
+        max_of(-high, V{}) * half_x2 / (high_axis * (high * high + high_axis * high_axis));
+    const V radius = sqrt_of(most_x * most_x + most_y * most_y);
+    const V all = all_lanes<V>(turn);
+    const V elevation0 = has_pole ? latitude - radius : latitude + y0 - low_rise;
+    const V elevation1 = has_pole ? latitude + radius : latitude + y1 + high_rise;
+    DirectionBox<V> box;
+    box.azimuth0 = is_beside | has_pole ? -all : longitude + x0 / least_axis - kDirectionMargin;
+    box.azimuth1 = is_beside | has_pole ? all : longitude + x1 / least_axis + kDirectionMargin;
+    box.elevation0 = is_beside ? -all : elevation0 - kDirectionMargin;
+    box.elevation1 = is_beside ? all : elevation1 + kDirectionMargin;
+    return box;
 }
 
-// Returns a lower bound on the distance of any point of the ellipsoid q <= reach2, in
-// units of the mean's distance.
-V3DG_HD inline float nearest_share(const SeenGaussian<float>& seen, float reach2) {
-    float uu = 0;
+// Returns a lower bound on the distance of any point of the ellipsoid q <= reach2.
+template <class V>
+V3DG_HD V3DG_INLINE V nearest_of(const SeenGaussian<V>& seen, const V& reach2) {
+    using T = Lane<V>;
+    V uu = V{};
     for (int k = 0; k < 3; ++k) {
-        const float along = seen.sigma[k] * dot3(seen.axis[k], seen.direction);
+        const V along = seen.sigma[k] * dot3(seen.axis[k], seen.direction);
         uu += along * along;
     }
-    return max_of(1.0f - 1e-5f - sqrt_of(reach2 * uu) * (1.0f + 1e-5f), 0.0f);
+    const V share = T(1 - 1e-5) - sqrt_of(reach2 * uu) * T(1 + 1e-5);
+    return max_of(share, V{}) * seen.distance;
 }
 
 }  // namespace v3dg

@@ -22,6 +22,23 @@ namespace v3dg {
 constexpr int kRayTileColumns = 16, kRayTileRows = 8;
 constexpr int kRayTileSize = kRayTileColumns * kRayTileRows;
 
+// Ascending angles, and where to begin a search among them.
+class AngleTable {
+  public:
+    explicit AngleTable(Span<const double> angles);
+
+    int size() const { return static_cast<int>(angles_.size()); }
+    // Returns the index of the first angle that is not below `value`; 0 for NaN.
+    int first_from(float value) const;
+    // Returns the index of the last angle that is not above `value`, or -1.
+    int last_up_to(float value) const;
+
+  private:
+    std::vector<float> angles_;
+    std::vector<int32_t> first_in_bucket_;  // buckets of equal width
+    float buckets_per_radian_;
+};
+
 // The directions of the rays. In view space x is forward, y left and z up; azimuths
 // turn from x to y, and elevations are above the xy plane. The tables ascend; azimuths
 // are in [0, 2 pi), elevations in [-pi/2, pi/2].
@@ -29,12 +46,12 @@ class RayGrid {
   public:
     RayGrid(Span<const double> azimuth, Span<const double> elevation);
 
-    int num_columns() const { return num_columns_; }
-    int num_rows() const { return num_rows_; }
-    int tile_columns() const { return (num_columns_ + kRayTileColumns - 1) / kRayTileColumns; }
-    int tile_rows() const { return (num_rows_ + kRayTileRows - 1) / kRayTileRows; }
+    int num_columns() const { return azimuth_.size(); }
+    int num_rows() const { return elevation_.size(); }
+    int tile_columns() const { return (num_columns() + kRayTileColumns - 1) / kRayTileColumns; }
+    int tile_rows() const { return (num_rows() + kRayTileRows - 1) / kRayTileRows; }
     size_t num_tiles() const { return size_t(tile_columns()) * tile_rows(); }
-    size_t num_rays() const { return size_t(num_columns_) * num_rows_; }
+    size_t num_rays() const { return size_t(num_columns()) * num_rows(); }
 
     // The cosines and sines of the angles, padded with zeros to whole tiles.
     const float* azimuth_cosine() const { return azimuth_cosine_.data(); }
@@ -49,16 +66,15 @@ class RayGrid {
 
         bool is_empty() const { return row0 > row1 || column0 > column1; }
     };
-    Range range_of(const DirectionBox& box) const;
+    Range range_of(const DirectionBox<float>& box) const;
 
   private:
-    int num_columns_, num_rows_;
-    std::vector<float> azimuth_, elevation_;
+    AngleTable azimuth_, elevation_;
     std::vector<float> azimuth_cosine_, azimuth_sine_, elevation_cosine_, elevation_sine_;
 };
 
-// A gaussian that reaches rays.
-struct RayRecord {
+// A gaussian that reaches rays. It fills two cache lines.
+struct alignas(64) RayRecord {
     RayShape<float> shape;
     float color[3];
     float nearest;  // no ray has a hit in front of this distance

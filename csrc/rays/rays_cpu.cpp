@@ -16,19 +16,8 @@ using V = Vec<float>;
 
 // The number of gaussians between two times at which the hits of rays are blended.
 constexpr size_t kFlushed = 32;
-
-static V3DG_INLINE SeenGaussian<float> lane_of(const SeenGaussian<V>& seen, int i) {
-    SeenGaussian<float> one;
-    for (int k = 0; k < 3; ++k) {
-        one.direction[k] = seen.direction[k][i];
-        one.sigma[k] = seen.sigma[k][i];
-        for (int a = 0; a < 3; ++a) one.axis[k][a] = seen.axis[k][a][i];
-    }
-    one.distance = seen.distance[i];
-    one.log2_opacity = seen.log2_opacity[i];
-    one.determinant = seen.determinant[i];
-    return one;
-}
+// How many entries ahead records are loaded into the cache.
+constexpr size_t kAhead = 6;
 
 static V3DG_INLINE RayShape<float> lane_of(const RayShape<V>& shape, int i) {
     RayShape<float> one;
@@ -72,17 +61,18 @@ static void project_rows(const Source& from, const Draw<float>& draw, uint64_t f
                                             draw.appearance.is_limited);
         if (draw.weight < 1) seen.log2_opacity += log2_of(draw.weight);
         const unsigned visible = bits_of(is_visible(seen, g.opacity)) & lanes;
+        if (visible == 0) continue;
+        const V reach2 =
+            (seen.log2_opacity - float(kLog2MinAlpha)) * float(1 / (kFalloffScale * kFalloffScale));
+        const V nearest = nearest_of(seen, reach2);
+        const DirectionBox<V> box = directions_of(seen, reach2);
         unsigned kept = 0;
         RayGrid::Range range[kWidth];
-        float nearest[kWidth];
-        for (unsigned left = visible; left != 0; left &= left - 1) {
+        const auto is_near = nearest <= all_lanes<V>(limits.farthest);
+        for (unsigned left = visible & bits_of(is_near); left != 0; left &= left - 1) {
             const int i = __builtin_ctz(left);
-            const SeenGaussian<float> one = lane_of(seen, i);
-            const float reach2 = (one.log2_opacity - float(kLog2MinAlpha)) *
-                                 float(1 / (kFalloffScale * kFalloffScale));
-            nearest[i] = one.distance * nearest_share(one, reach2);
-            if (nearest[i] > limits.farthest) continue;
-            range[i] = grid.range_of(directions_of(one, reach2));
+            range[i] = grid.range_of(
+                {box.azimuth0[i], box.azimuth1[i], box.elevation0[i], box.elevation1[i]});
             if (!range[i].is_empty()) kept |= 1u << i;
         }
         if (kept == 0) continue;
@@ -153,25 +143,41 @@ static void blend_pending(const RayRecord* records, float end, const RayLimits& 
 }
 
 // Adds the hits of one gaussian to the rays of a row of a tile. `x`, `y` and `z` are
-// the directions of the rays.
+// the directions of the rays. Bit k of `vectors` is set if the gaussian may reach the
+// rays of vector k.
 static V3DG_INLINE void hit_row(const RayRecord& record, uint32_t index, const RayLimits& limits,
-                                int first_ray, const float* x, const float* y, float z,
-                                const TileRays& rays, RayScratch& scratch) {
+                                unsigned vectors, int first_ray, const float* x, const float* y,
+                                float z, const TileRays& rays, RayScratch& scratch) {
     const V reach = all_lanes<V>(record.shape.log2_opacity - float(kLog2MinAlpha));
-    for (int c = 0; c < kRayTileColumns; c += kLanes<float>) {
+    for (; vectors != 0; vectors &= vectors - 1) {
+        const int c = __builtin_ctz(vectors) * kLanes<float>;
         const RayHit<V> hit = hit_of(record.shape, load(x + c), load(y + c), all_lanes<V>(z));
         const auto is_hit = (hit.falloff <= reach) & (hit.range >= all_lanes<V>(limits.nearest)) &
                             (hit.range <= all_lanes<V>(limits.farthest));
         unsigned bits = bits_of(is_hit);
         if (bits == 0) continue;
-        const V alpha = min_of(
-            exp2_in_range(max_of(record.shape.log2_opacity - hit.falloff, all_lanes<V>(-100.0f))),
-            all_lanes<V>(float(kMaxAlpha)));
+        // No alpha is below 1/255, except in lanes that are not hit.
+        const V log2_alpha =
+            max_of(record.shape.log2_opacity - hit.falloff, all_lanes<V>(float(kLog2MinAlpha - 1)));
+        const V alpha = min_of(exp2_in_range(log2_alpha), all_lanes<V>(float(kMaxAlpha)));
         for (; bits != 0; bits &= bits - 1) {
             const int i = __builtin_ctz(bits), ray = first_ray + c + i;
             if (rays.is_open(ray)) scratch.pending[ray].push_back({hit.range[i], alpha[i], index});
         }
     }
+}
+
+// Returns the vectors of a tile's rows that have a column of the range; `column` is the
+// first of the tile.
+static V3DG_INLINE unsigned vectors_of(const RayGrid::Range& range, int column, int num_columns) {
+    unsigned vectors = 0;
+    for (int c = 0; c < kRayTileColumns; c += kLanes<float>) {
+        const int first = column + c, last = first + kLanes<float> - 1;
+        const bool is_reached = first <= range.column1 && last >= range.column0;
+        const bool is_reached_again = first + num_columns <= range.column1;
+        if (is_reached || is_reached_again) vectors |= 1u << (c / kLanes<float>);
+    }
+    return vectors;
 }
 
 void cast_tile(const RayRecord* records, Span<const uint64_t> entries, const RayGrid& grid,
@@ -200,13 +206,19 @@ void cast_tile(const RayRecord* records, Span<const uint64_t> entries, const Ray
                 blend_pending(records, end, limits, ray, has_returns, scratch, rays, left[ray]);
     };
     for (size_t e = 0; e < entries.size && rays.num_open > 0; ++e) {
+        if (e + kAhead < entries.size) {
+            const RayRecord* next = records + static_cast<uint32_t>(entries[e + kAhead]);
+            __builtin_prefetch(next);
+            __builtin_prefetch(reinterpret_cast<const char*>(next) + 64);
+        }
         const auto index = static_cast<uint32_t>(entries[e]);
         const RayRecord& record = records[index];
         if (e % kFlushed == kFlushed - 1) blend_before(record.nearest);
         const int last = std::min(record.range.row1 - row, num_rows - 1);
+        const unsigned vectors = vectors_of(record.range, column, grid.num_columns());
         for (int r = std::max(record.range.row0 - row, 0); r <= last; ++r) {
             const int first_ray = kRayTileColumns * r;
-            hit_row(record, index, limits, first_ray, x + first_ray, y + first_ray,
+            hit_row(record, index, limits, vectors, first_ray, x + first_ray, y + first_ray,
                     grid.elevation_sine()[row + r], rays, scratch);
         }
     }
