@@ -665,6 +665,7 @@ class Cameras:
         viewmats: (B, 4, 4).
         K: (B, 3, 3), or (3, 3) for all.
         environments: (B,), or None where each camera sees all instances.
+        lenses: The cameras on the CPU if some have lens distortion, or None.
     """
 
     def __init__(
@@ -676,6 +677,7 @@ class Cameras:
         height: int,
         near: float,
         environments: Array | None = None,
+        lenses: list[Camera] | None = None,
     ) -> None: ...
     def __len__(self) -> int: ...
 

@@ -111,7 +111,7 @@ class EquirectangularCamera:
     @property
     def position(self) -> Floats:
         """(3,) position of the camera in the world."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+        return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
     def directions(self, positions: MatrixLike) -> Floats:
         """Return the directions that are seen at positions in the image.
@@ -254,12 +254,12 @@ def sensor_core(
     )
 
 
-def _angles(values: Sequence[float] | Floats, name: str, most: float) -> Floats:
+def _angles(values: Sequence[float] | Floats, name: str, limit: float) -> Floats:
     angles = floats(values, name)
     is_table = angles.ndim == 1 and 0 < len(angles) <= _MOST_ANGLES
     check(name, is_table, f"1 to {_MOST_ANGLES:,} angles, got shape {angles.shape}")
     largest = np.abs(angles).max()
-    check(name, largest <= most, f"radians from {-most:g} to {most:g}, got {largest:g}")
+    check(name, largest <= limit, f"radians from {-limit:g} to {limit:g}, got {largest:g}")
     angles.flags.writeable = False
     return angles
 

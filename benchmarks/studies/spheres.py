@@ -88,10 +88,10 @@ def alphas_by_projection(gaussians: Gaussians, width: int) -> Floats:
             ]
         )
         conic = np.linalg.inv(by_point @ _covariance(gaussians, i) @ by_point.T)
-        beside = (columns.ravel() - u + width / 2) % width - width / 2
-        below = rows.ravel() - v
-        square = conic[0, 0] * beside**2 + 2 * conic[0, 1] * beside * below
-        square += conic[1, 1] * below**2
+        offset_u = (columns.ravel() - u + width / 2) % width - width / 2
+        offset_v = rows.ravel() - v
+        square = conic[0, 0] * offset_u**2 + 2 * conic[0, 1] * offset_u * offset_v
+        square += conic[1, 1] * offset_v**2
         alphas[i] = gaussians.opacities[i] * np.exp(-0.5 * square)
     return alphas
 
@@ -99,13 +99,13 @@ def alphas_by_projection(gaussians: Gaussians, width: int) -> Floats:
 def blended(gaussians: Gaussians, alphas: Floats, order: Floats) -> Floats:
     """Return (R, 4) colour and alpha; `order` is (N, R), by which gaussians are
     blended."""
-    kept = np.where(alphas >= _MIN_ALPHA, np.minimum(alphas, _MAX_ALPHA), 0)
+    blendable = np.where(alphas >= _MIN_ALPHA, np.minimum(alphas, _MAX_ALPHA), 0)
     shade = np.maximum(0.28209479177387814 * gaussians.sh[:, 0].astype(np.float64) + 0.5, 0)
     rank = np.argsort(order, axis=0, kind="stable")
-    sorted_alphas = np.take_along_axis(kept, rank, axis=0)
+    sorted_alphas = np.take_along_axis(blendable, rank, axis=0)
     passed = np.cumprod(1 - sorted_alphas, axis=0)
-    before = np.concatenate([np.ones((1, passed.shape[1])), passed[:-1]])
-    weights = before * sorted_alphas
+    arriving = np.concatenate([np.ones((1, passed.shape[1])), passed[:-1]])
+    weights = arriving * sorted_alphas
     color = np.einsum("nr,nrc->rc", weights, shade[rank])
     return np.column_stack([color, 1 - passed[-1]])
 
@@ -144,19 +144,21 @@ def main() -> None:
     latitudes = np.repeat(latitude, _WIDTH)
     print("| way | latitude | " + " | ".join(f"{size:g}°" for size in _SIZES) + " |")
     print("| --- | --- |" + " --- |" * len(_SIZES))
-    found = {
+    errors_by_size = {
         size: [
             differences(random_gaussians(np.random.default_rng(seed), size))
             for seed in range(options.scenes)
         ]
         for size in _SIZES
     }
-    for way in found[_SIZES[0]][0]:
+    for way in errors_by_size[_SIZES[0]][0]:
         for low, high in _BANDS:
             is_in_band = (latitudes >= low) & (latitudes < high)
             cells = []
             for size in _SIZES:
-                errors = np.concatenate([scene[way][is_in_band].ravel() for scene in found[size]])
+                errors = np.concatenate(
+                    [scene[way][is_in_band].ravel() for scene in errors_by_size[size]]
+                )
                 cells.append(f"{errors.mean():.1e}, {np.quantile(errors, 0.99):.1e}")
             print(f"| {way} | {low}° to {high}° | " + " | ".join(cells) + " |", flush=True)
 

@@ -21,7 +21,8 @@ namespace v3dg {
 namespace {
 
 constexpr uint64_t kPieceSize = 4096;
-constexpr size_t kMostBinChunks = 64;
+// The largest number of chunks whose records are counted by tile, and of counters.
+constexpr size_t kMostBinChunks = 64, kMostBinCounters = size_t(1) << 24;
 constexpr float kTurn = static_cast<float>(2 * kPi);
 
 // A part of a draw.
@@ -94,7 +95,8 @@ struct RayLists {
 
     RayLists(const RayRecord* records, size_t size, const RayGrid& grid) {
         const size_t tiles = grid.num_tiles();
-        const size_t num_chunks = std::clamp<size_t>(size / kPieceSize, 1, kMostBinChunks);
+        const size_t most_chunks = std::clamp<size_t>(kMostBinCounters / tiles, 1, kMostBinChunks);
+        const size_t num_chunks = std::clamp<size_t>(size / kPieceSize, 1, most_chunks);
         const auto begin = [&](size_t chunk) { return size * chunk / num_chunks; };
         std::vector<std::vector<uint64_t>> next(num_chunks);
         parallel_for(num_chunks, 1, [&](size_t chunk) {

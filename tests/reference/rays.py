@@ -1,4 +1,5 @@
-"""Every gaussian on every ray, in space, in float64."""
+"""Blends every gaussian on every ray in float64, with its largest value on the ray in
+3D."""
 
 from __future__ import annotations
 
@@ -31,40 +32,22 @@ def cast(
     gaussians, eye, directions, *, filters_rad2=0.0, antialiased=False, near=0.01, far=np.inf
 ) -> Rays:
     """Blend on each ray (R,3), unit vectors in the world, the largest values of the
-    gaussians, ordered by their distances.
-
-    The filter adds its variance times the squared distance of the mean to the
-    covariance; compensated opacities keep the integral over the plane across the mean.
-    """
+    gaussians, ordered by their distances."""
     means = gaussians.means.astype(np.float64) - eye
-    distance2 = (means**2).sum(axis=1)
-    axes = rotation(gaussians.quats) * gaussians.scales[:, None, :].astype(np.float64)
-    covariances = axes @ axes.transpose(0, 2, 1)
-    filtered = covariances + (filters_rad2 * distance2)[:, None, None] * np.eye(3)
-    opacities = gaussians.opacities.astype(np.float64)
-    before = _across(covariances, means)
-    after = _across(filtered, means)
-    opacities = np.where(antialiased, opacities * np.sqrt(before / after), opacities)
-    precisions = np.linalg.inv(filtered)
-    toward_mean = np.einsum("nij,nj->ni", precisions, means)
-    above = directions @ toward_mean.T
-    below = np.einsum("ri,nij,rj->rn", directions, precisions, directions)
-    ranges = above / below
-    offsets = ranges[:, :, None] * directions[:, None] - means
-    square = np.einsum("rni,nij,rnj->rn", offsets, precisions, offsets)
-    alphas = opacities * np.exp(-0.5 * square)
+    covariances, opacities = _filtered(gaussians, means, filters_rad2, antialiased)
+    alphas, ranges = _largest(means, covariances, opacities, directions)
     colors = reference_sh.color(gaussians.sh, means)
     is_hit = (alphas >= ALPHA_MIN) & (ranges >= near) & (ranges <= far)
-    cutoff = np.abs(alphas / ALPHA_MIN - 1).min(axis=1)
-    alphas = np.minimum(alphas, ALPHA_MAX)
+    num_rays = len(directions)
     result = Rays(
-        np.zeros((len(directions), 3)),
-        np.zeros(len(directions)),
-        np.zeros(len(directions)),
-        [],
-        cutoff,
+        color=np.zeros((num_rays, 3)),
+        alpha=np.zeros(num_rays),
+        mean_range=np.zeros(num_rays),
+        contributions=[],
+        cutoff_distance=np.abs(alphas / ALPHA_MIN - 1).min(axis=1),
     )
-    for ray in range(len(directions)):
+    alphas = np.minimum(alphas, ALPHA_MAX)
+    for ray in range(num_rays):
         hit = np.flatnonzero(is_hit[ray])
         hit = hit[np.argsort(ranges[ray, hit], kind="stable")]
         passed = np.concatenate([[1.0], np.cumprod(1 - alphas[ray, hit])])
@@ -80,8 +63,32 @@ def cast(
     return result
 
 
+def _filtered(gaussians, means, filters_rad2, antialiased):
+    """Return covariances and opacities with a filter. It adds its variance times the
+    squared distance of the mean. Compensated opacities preserve the integral over the
+    plane across the mean."""
+    axes = rotation(gaussians.quats) * gaussians.scales[:, None, :].astype(np.float64)
+    covariances = axes @ axes.transpose(0, 2, 1)
+    variances = filters_rad2 * (means**2).sum(axis=1)
+    filtered = covariances + variances[:, None, None] * np.eye(3)
+    opacities = gaussians.opacities.astype(np.float64)
+    share = np.sqrt(_across(covariances, means) / _across(filtered, means))
+    return filtered, np.where(antialiased, opacities * share, opacities)
+
+
+def _largest(means, covariances, opacities, directions):
+    """Return (R,N) the largest alphas on rays, and the distances of their places."""
+    precisions = np.linalg.inv(covariances)
+    forward = directions @ np.einsum("nij,nj->ni", precisions, means).T
+    ranges = forward / np.einsum("ri,nij,rj->rn", directions, precisions, directions)
+    offsets = ranges[:, :, None] * directions[:, None] - means
+    square = np.einsum("rni,nij,rnj->rn", offsets, precisions, offsets)
+    return opacities * np.exp(-0.5 * square), ranges
+
+
 def _across(covariances, means):
-    """Determinants of the covariances, projected along the directions of the means."""
+    """Return the determinants of the covariances, projected along the directions of the
+    means."""
     unit = means / np.linalg.norm(means, axis=1, keepdims=True)
     first = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -90,17 +97,17 @@ def _across(covariances, means):
 
 
 def returns(contributions, detection, gap, count=2):
-    """(count,3) range, weight and intensity of each layer of a ray."""
+    """Return (count,3) the range, weight and intensity of each layer of a ray."""
     layers = np.tile([np.inf, 0, 0], (count, 1))
-    rest = contributions
+    remaining = contributions
     for k in range(count):
-        detected = np.flatnonzero(np.cumsum(rest[:, 1]) >= detection)
+        detected = np.flatnonzero(np.cumsum(remaining[:, 1]) >= detection)
         if not len(detected):
             break
-        is_in = rest[:, 0] <= rest[detected[0], 0] + gap
-        layer = rest[is_in]
+        is_in = remaining[:, 0] <= remaining[detected[0], 0] + gap
+        layer = remaining[is_in]
         weight = layer[:, 1].sum()
         median = np.argmax(np.cumsum(layer[:, 1]) >= 0.5 * weight)
         layers[k] = layer[median, 0], weight, layer[:, 1] @ layer[:, 2]
-        rest = rest[~is_in]
+        remaining = remaining[~is_in]
     return layers

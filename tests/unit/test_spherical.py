@@ -1,5 +1,5 @@
-"""Equirectangular cameras and LiDARs: rays against float64, seams and poles, cuts and
-returns."""
+"""Tests equirectangular cameras and LiDARs: rays against float64, seams and poles, cuts
+and returns."""
 
 import math
 import os
@@ -33,8 +33,8 @@ def _unit(vector):
 
 
 def around(rng, count, size):
-    """Gaussians in all directions, many of them at the poles and the seam of a sensor
-    in the origin; `size` is their standard deviation as an angle."""
+    """Return gaussians in all directions, many of them at a pole and at the seam of a
+    camera in the origin. `size` is their standard deviation as an angle."""
     directions = rng.normal(size=(count, 3))
     directions[: count // 4] = [0, 1, 0] + 0.1 * rng.normal(size=(count // 4, 3))
     directions[count // 4 : count // 2] = [0, -0.2, -1] + 0.1 * rng.normal(size=(count // 4, 3))
@@ -60,7 +60,8 @@ def dot(point, opacity=0.9, size=0.01, gray=1.0):
 
 
 def assert_like(values, reference, cutoff, bound):
-    """Compare rays, but for those with an alpha at 1/255, which rounding decides."""
+    """Compare rays, except for those with an alpha near 1/255, which rounding
+    decides."""
     is_clear = cutoff > 1e-3
     assert is_clear.mean() > 0.5
     np.testing.assert_allclose(
@@ -96,14 +97,14 @@ def test_a_dot_is_drawn_where_its_direction_is(direction):
     point = 3 * _unit(np.array(direction))
     image = v3dg.render(dot(point, size=0.1), camera, depth=True)
     row, column = np.unravel_index(image.alpha.argmax(), image.alpha.shape)
-    seen = camera.directions([[column + 0.5, row + 0.5]])[0]
-    assert seen @ point / 3 > math.cos(2 * math.pi / 128)
+    ray = camera.directions([[column + 0.5, row + 0.5]])[0]
+    assert ray @ point / 3 > math.cos(2 * math.pi / 128)
     np.testing.assert_allclose(image.depth[row, column], 3, rtol=1e-3)
 
 
 def test_a_panorama_has_no_seam():
-    """Half a turn of the camera moves the picture by half its width, whose columns then
-    cross the border."""
+    """If the camera makes half a turn, the picture moves by half of its width across
+    the border."""
     rng = np.random.default_rng(5)
     gaussians = around(rng, 100, 0.15)
     first = v3dg.render(gaussians, EquirectangularCamera(np.eye(4), 64))
@@ -123,7 +124,8 @@ def test_a_level_camera_has_up_in_its_first_row():
 
 
 def selected(scene, sensor_spacing, eye, tolerance):
-    """The gaussians of the cut, relative to the eye, with filters in rad²."""
+    """Return the gaussians of the cut relative to the eye, their filters in rad², and
+    whether their opacities are compensated."""
     focal = 1 / sensor_spacing
     viewmat = np.eye(4)
     viewmat[:3, 3] = -eye
@@ -135,16 +137,15 @@ def selected(scene, sensor_spacing, eye, tolerance):
 
 @pytest.mark.parametrize("tolerance", [0.0, 3.0, 400.0])
 def test_no_cluster_that_a_scan_sees_is_left_out(tolerance):
-    """The rays in float64 go through all selected gaussians, near and far, without any
-    culling."""
+    """The rays in float64 pass through all selected gaussians, without any culling."""
     rng = np.random.default_rng(7)
     scene = random_scene(rng, lod_bundle(rng, blob(rng, 200, sh_degree=1), 16), 6, spread=3)
     eye = rng.normal(size=3)
     pose = pose_of(rng, eye)
     lidar = Lidar(FULL_TURN[::2], np.linspace(-1.3, 1.3, 12), near=0.02)
-    found = v3dg.scan(scene, lidar, pose, tolerance=tolerance)
+    scanned = v3dg.scan(scene, lidar, pose, tolerance=tolerance)
     gaussians, filters, antialiased = selected(scene, lidar.spacing, eye, tolerance)
-    assert found.gaussians == len(gaussians)
+    assert scanned.gaussians == len(gaussians)
     directions = lidar.directions.reshape(-1, 3) @ pose[:3, :3].T
     exact = reference_rays.cast(
         gaussians,
@@ -155,29 +156,29 @@ def test_no_cluster_that_a_scan_sees_is_left_out(tolerance):
         near=lidar.near,
     )
     assert (exact.alpha > 0.5).mean() > 0.05
-    assert_like(found.alpha, exact.alpha, exact.cutoff_distance, 2e-4)
+    assert_like(scanned.alpha, exact.alpha, exact.cutoff_distance, 2e-4)
     layers = np.array(
         [reference_rays.returns(ray, lidar.detection, lidar.gap) for ray in exact.contributions]
     )
-    values = np.stack([found.range.ravel(), found.second_range.ravel()], axis=1)
+    values = np.stack([scanned.range.ravel(), scanned.second_range.ravel()], axis=1)
     is_close = np.isclose(values, layers[:, :, 0], rtol=1e-3)
     assert is_close.mean() > 0.99  # rounding decides which gaussian is the median
-    light = np.stack([found.intensity.ravel(), found.second_intensity.ravel()], axis=1)
+    light = np.stack([scanned.intensity.ravel(), scanned.second_intensity.ravel()], axis=1)
     assert np.isclose(light, layers[:, :, 2], atol=1e-3).mean() > 0.99
 
 
 def test_a_ray_does_not_depend_on_the_other_rays():
-    """Neither on tiles, nor on the box of directions that gaussians are sorted by."""
+    """Neither the tiles nor the boxes of directions change a result."""
     rng = np.random.default_rng(8)
     scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 10, spread=3)
     pose = pose_of(rng, [0.3, 0.2, -0.1])
     whole = v3dg.scan(scene, LIDAR, pose)
     for rows, columns in ((slice(3, 5), slice(None)), (slice(None), slice(61, 64)), ([7], [20])):
         part = replace(LIDAR, azimuth=LIDAR.azimuth[columns], elevation=LIDAR.elevation[rows])
-        found = v3dg.scan(scene, part, pose)
+        scanned = v3dg.scan(scene, part, pose)
         for name in ("range", "intensity", "second_range", "second_intensity", "alpha"):
             expected = getattr(whole, name)[rows][:, columns]
-            np.testing.assert_array_equal(getattr(found, name), expected, err_msg=name)
+            np.testing.assert_array_equal(getattr(scanned, name), expected, err_msg=name)
 
 
 _SCAN = """
@@ -226,22 +227,22 @@ def lidar_at(azimuths, **changes):
 
 def test_returns_are_layers_of_light():
     leaf = dot((5, 0, 0), opacity=0.4, gray=0.5)
-    behind = dot((5.2, 0, 0), opacity=0.5, gray=0.5)
+    branch = dot((5.2, 0, 0), opacity=0.5, gray=0.5)
     wall = dot((9, 0, 0), opacity=0.9, gray=1.0)
     dust = dot((2, 0, 0), opacity=0.05, gray=1.0)
-    both = v3dg.join([dust, leaf, behind, wall])
-    found = v3dg.scan(both, lidar_at([0.0], gap=0.5, detection=0.1), np.eye(4))
+    scene = v3dg.join([dust, leaf, branch, wall])
+    scanned = v3dg.scan(scene, lidar_at([0.0], gap=0.5, detection=0.1), np.eye(4))
     # The dust is below the detection, so that it counts towards the next layer.
     weights = 0.05, 0.95 * 0.4, 0.95 * 0.6 * 0.5, 0.95 * 0.6 * 0.5 * 0.9
-    np.testing.assert_allclose(found.range, 5, rtol=1e-5)
+    np.testing.assert_allclose(scanned.range, 5, rtol=1e-5)
     np.testing.assert_allclose(
-        found.intensity, weights[0] + 0.5 * (weights[1] + weights[2]), rtol=1e-4
+        scanned.intensity, weights[0] + 0.5 * (weights[1] + weights[2]), rtol=1e-4
     )
-    np.testing.assert_allclose(found.second_range, 9, rtol=1e-5)
-    np.testing.assert_allclose(found.second_intensity, weights[3], rtol=1e-4)
-    np.testing.assert_allclose(found.alpha, sum(weights), rtol=1e-4)
-    apart = v3dg.scan(both, lidar_at([0.0], gap=0.1, detection=0.01), np.eye(4))
-    np.testing.assert_allclose([apart.range[0, 0], apart.second_range[0, 0]], [2, 5], rtol=1e-5)
+    np.testing.assert_allclose(scanned.second_range, 9, rtol=1e-5)
+    np.testing.assert_allclose(scanned.second_intensity, weights[3], rtol=1e-4)
+    np.testing.assert_allclose(scanned.alpha, sum(weights), rtol=1e-4)
+    split = v3dg.scan(scene, lidar_at([0.0], gap=0.1, detection=0.01), np.eye(4))
+    np.testing.assert_allclose([split.range[0, 0], split.second_range[0, 0]], [2, 5], rtol=1e-5)
 
 
 def test_points_are_in_the_world():
@@ -251,11 +252,11 @@ def test_points_are_in_the_world():
     places = lidar.directions[0] * np.array([[4.0], [6], [5]])
     world = places @ pose[:3, :3].T + pose[:3, 3]
     scene = v3dg.join([dot(point, size=0.05) for point in world[:2]])
-    found = v3dg.scan(scene, lidar, pose)
-    np.testing.assert_allclose(found.points(), world[:2], atol=1e-4)
-    assert np.isinf(found.range[0, 2])
-    assert found.second_points().shape == (0, 3)
-    assert found.intensity[0, 2] == 0
+    scanned = v3dg.scan(scene, lidar, pose)
+    np.testing.assert_allclose(scanned.points(), world[:2], atol=1e-4)
+    assert np.isinf(scanned.range[0, 2])
+    assert scanned.second_points().shape == (0, 3)
+    assert scanned.intensity[0, 2] == 0
 
 
 def test_only_places_between_near_and_far_are_hit():
@@ -267,15 +268,15 @@ def test_only_places_between_near_and_far_are_hit():
         (2.5, 3.0): math.inf,
     }
     for (near, far), expected in ranges.items():
-        found = v3dg.scan(dots, lidar_at([0.0], near=near, far=far), np.eye(4))
-        np.testing.assert_allclose(found.range, expected, rtol=1e-5)
+        scanned = v3dg.scan(dots, lidar_at([0.0], near=near, far=far), np.eye(4))
+        np.testing.assert_allclose(scanned.range, expected, rtol=1e-5)
 
 
 def test_an_eye_inside_a_gaussian_sees_it_in_front_only():
     cloud = dot((0.5, 0, 0), size=1.0)
-    found = v3dg.scan(cloud, lidar_at([0.0, math.pi]), np.eye(4))
-    np.testing.assert_allclose(found.range[0, 0], 0.5, rtol=1e-4)
-    assert np.isinf(found.range[0, 1])
+    scanned = v3dg.scan(cloud, lidar_at([0.0, math.pi]), np.eye(4))
+    np.testing.assert_allclose(scanned.range[0, 0], 0.5, rtol=1e-4)
+    assert np.isinf(scanned.range[0, 1])
 
 
 @pytest.mark.parametrize("broken", ["means", "quats", "scales", "opacities"])
@@ -283,8 +284,8 @@ def test_an_eye_inside_a_gaussian_sees_it_in_front_only():
 def test_gaussians_that_are_not_finite_are_not_hit(broken, value):
     gaussians = dot((3, 0, 0), size=0.1)
     getattr(gaussians, broken)[:] = value
-    found = v3dg.scan(gaussians, lidar_at([0.0, 1.0, 4.0]), np.eye(4))
-    assert (found.alpha == 0).all()
+    scanned = v3dg.scan(gaussians, lidar_at([0.0, 1.0, 4.0]), np.eye(4))
+    assert (scanned.alpha == 0).all()
 
 
 def test_factors_of_instances_and_weights_count():
@@ -323,6 +324,12 @@ ERRORS = {
     ),
     "budget: expected none": lambda: v3dg.render(
         dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), budget=3
+    ),
+    "memory: expected 'auto' or None": lambda: v3dg.render(
+        dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), memory=10**9
+    ),
+    "min_transmittance: expected None": lambda: v3dg.render(
+        dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), min_transmittance=0.1
     ),
     "color_by: expected 'appearance'": lambda: v3dg.render(
         dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), color_by="level"

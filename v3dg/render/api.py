@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, color, one_of, vector, whole
+from v3dg._numbers import check, one_of, vector, whole
 from v3dg.camera_batch import CameraBatch
 from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.false_color import ColorBy
@@ -21,7 +21,7 @@ from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
-from v3dg.render.rays import check_rays_device, draw_sphere
+from v3dg.render.rays import check_rays, draw_sphere
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
 from v3dg.residency import residency
@@ -101,7 +101,7 @@ def render(
             selected gaussians. None means the first camera of a scene's file, else the
             camera of `first_camera`. An `EquirectangularCamera` is drawn on the CPU
             with all gaussians resident, without statistics, and takes neither
-            `budget`, `cut` nor `min_transmittance`.
+            `budget`, `cut`, `min_transmittance` nor a number of bytes as `memory`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -135,18 +135,11 @@ def render(
     else:
         opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
-    if isinstance(camera, EquirectangularCamera):
-        refused = {"cut": cut, "min_transmittance": min_transmittance}
-        for name, value in refused.items():
-            check(name, value is None, "none for an equirectangular camera, got one; leave it out")
-        check("color_by", color_by == "appearance", f"'appearance' for rays, got {color_by!r}")
-        check_rays_device(device)
-        sphere_cut = CutRequest(tolerance, budget, min_level, fade)
-        behind = color(background, "background")
-        return draw_sphere(opened_subject, camera, sphere_cut, behind, depth=depth)
-    chosen_device = _device.resolve(device)
-    frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
+    if isinstance(camera, EquirectangularCamera):
+        check_rays(color_by, cut, min_transmittance, device, memory)
+        return draw_sphere(opened_subject, camera, cut_request, background, depth=depth)
+    frame = _still_frame(opened_subject, color_by, _device.resolve(device), pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
     shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
 

@@ -9,15 +9,20 @@ import numpy as np
 from v3dg import _core, _device
 from v3dg._device import CPU, Device
 from v3dg._numbers import check
+from v3dg._numbers import color as color_of
 from v3dg.gaussians import TRAINED_FILTER_PX2, Gaussians
 from v3dg.image import Image
 from v3dg.render.asset_frame import check_request
 from v3dg.residency import residency
+from v3dg.spherical import MIN_TRANSMITTANCE, EquirectangularCamera
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from v3dg.false_color import ColorBy
     from v3dg.render.request import CutRequest
     from v3dg.scene import Subject
-    from v3dg.spherical import EquirectangularCamera, RayTable
+    from v3dg.select import Selection
 
 
 def check_rays_device(device: str | Device) -> None:
@@ -27,6 +32,23 @@ def check_rays_device(device: str | Device) -> None:
     target = _device.resolve(device)
     expected = f"'cpu' or 'auto', because rays are cast on the CPU only, got {str(target)!r}"
     check("device", not target.is_cuda, expected)
+
+
+def check_rays(
+    color_by: ColorBy,
+    cut: Selection | None,
+    min_transmittance: float | None,
+    device: str | Device,
+    memory: int | str | None,
+) -> None:
+    """Raise ValueError for options of pictures that rays do not have."""
+    check("cut", cut is None, "none for an equirectangular camera, got one; leave it out")
+    check("color_by", color_by == "appearance", f"'appearance' for rays, got {color_by!r}")
+    expected = f"None for rays, which end at {MIN_TRANSMITTANCE:g}, got {min_transmittance}"
+    check("min_transmittance", min_transmittance is None, expected)
+    expected = f"'auto' or None for rays, which need all gaussians in memory, got {memory!r}"
+    check("memory", memory in ("auto", None), expected)
+    check_rays_device(device)
 
 
 def cast_rays(
@@ -75,18 +97,19 @@ def draw_sphere(
     subject: Subject,
     camera: EquirectangularCamera,
     cut: CutRequest,
-    background: list[float],
+    background: Sequence[float],
     *,
     depth: bool,
 ) -> Image:
     """Draw an equirectangular picture; its depth is the mean distance along the ray, by
     blend weight."""
+    back_color = color_of(background, "background")
     cast = cast_rays(subject, camera.core, cut)
-    table: RayTable = camera.table
+    table = camera.table
     alpha = table.in_order(cast.alpha)
     color = table.in_order(cast.color)
-    if any(background):
-        color += (1 - alpha[..., None]) * np.float32(background)
+    if any(back_color):
+        color += (1 - alpha[..., None]) * np.array(back_color, np.float32)
     distance = None
     if depth:
         distance = table.in_order(cast.range)
