@@ -1,9 +1,10 @@
 """Check that the compiled module runs on every x86-64 processor.
 
-Some sources are compiled once per instruction set, and every object holds copies of the
-inline functions that it uses. Had the linker kept such a copy from an AVX object, code
-that runs everywhere would call it. So: without entering the namespaces isa_avx2 and
-isa_avx512, no function can be reached that holds an instruction beyond plain x86-64.
+Some sources are compiled once per instruction set, and every object file contains
+copies of the inline functions that it uses. The linker keeps one of the copies. If it
+kept one that is compiled for AVX, code for all processors would call it. So this script
+checks that no function outside of the namespaces isa_avx2 and isa_avx512 reaches a
+function with instructions beyond the baseline of x86-64.
 
     python .ci/check_isa.py build/*/_core*.so      (not stripped)
 """
@@ -17,8 +18,8 @@ from dataclasses import dataclass, field
 
 FUNCTION = re.compile(r"^([0-9a-f]+) <(.*)>:$")
 TARGET = re.compile(r"\b([0-9a-f]+) <")
-# VEX and EVEX instructions begin with v, but so do two old ones; k* work on AVX-512
-# masks; the rest is BMI.
+# The names of VEX and EVEX instructions begin with v, as do those of two older
+# instructions. Those of instructions on AVX-512 masks begin with k. The rest is BMI.
 WIDE = re.compile(
     r"^(v(?!er[rw]\b)|k(add|and|mov|not|or|shift|test|unpck|xnor|xor)"
     r"|(andn|bextr|blsi|blsr|blsmsk|bzhi|mulx|pdep|pext|rorx|sarx|shlx|shrx|movbe|lzcnt|popcnt)\b)"
@@ -37,7 +38,7 @@ class Function:
 
 
 def disassemble(path: str) -> dict[str, Function]:
-    """All functions by address, in hexadecimal without leading zeros."""
+    """Return all functions by their addresses, in hexadecimal without leading zeros."""
     command = ["objdump", "-d", "-C", "-w", "--no-show-raw-insn", path]
     functions: dict[str, Function] = {}
     function = Function("")
@@ -63,7 +64,7 @@ def main(path: str) -> int:
         )
         return 1
     dispatched = sum(function.is_dispatched for function in functions.values())
-    # What no instruction refers to is called through tables or from outside.
+    # Functions that no instruction refers to are called through tables or from outside.
     called = {t for address, f in functions.items() for t in f.targets if t != address}
     todo = [
         address for address, f in functions.items() if address not in called and not f.is_dispatched

@@ -1,8 +1,9 @@
-"""How long tests took: the heaviest ones, the folders, and what answers first.
+"""Prints the durations of tests as Markdown: of the slowest tests, of folders, and the
+share of tests that end within five minutes.
 
     python .ci/durations.py build/ci/tests.xml
 
-reads what `pytest --junit-xml` wrote and prints Markdown.
+The file is the output of `pytest --junit-xml`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ SOON_SECONDS = 300
 
 
 def durations_of(path: Path) -> dict[str, float]:
-    """Seconds by the name of a test: its file's module, and what pytest calls it."""
+    """Return the duration of each test in seconds, by its module and name."""
     durations: dict[str, float] = {}
     for case in ElementTree.parse(path).iter("testcase"):
         name = f"{case.get('classname')}::{case.get('name')}"

@@ -1,5 +1,5 @@
-# The steps of .ci/run, a function each. They work in the root of the checkout and keep what they make in build/ci;
-# all but `environment` and `compile` need the environment that `environment` makes and `install` fills.
+# The steps of .ci/run, one function each. They run in the root of the checkout and write to build/ci. All steps
+# except `environment` and `compile` need the virtual environment that `environment` creates and `install` fills.
 # shellcheck shell=bash
 
 readonly test_command="pip install '.[test]' && pytest -n 2"
@@ -24,7 +24,7 @@ for requirement in importlib.metadata.requires("v3dg"):
 END
 }
 
-# PYTHON names the interpreter.
+# Creates the virtual environment. PYTHON is the name of the interpreter.
 environment() {
     rm -rf "$ci/venv"
     "${PYTHON:-python3}" -m venv "$ci/venv"
@@ -32,16 +32,16 @@ environment() {
     python --version
 }
 
-# The first half of the README's command; CXX names the compiler.
+# Runs the first half of the README's test command. CXX is the name of the compiler.
 install() {
     [ -d "$ci/venv" ] || environment
     enter
-    export CUDAARCHS="${CUDAARCHS:-90}"  # one architecture shows that the CUDA half compiles
+    export CUDAARCHS="${CUDAARCHS:-90}"  # one architecture suffices to show that the CUDA sources compile
     eval "${test_command%% && *}"
-    python -c "import torch; print('torch', torch.__version__)"  # without it the gradient tests would be skipped
+    python -c "import torch; print('torch', torch.__version__)"  # without torch, the tests of gradients are skipped
 }
 
-# What the linker kept for which instruction set.
+# Checks for which instruction set each function is compiled that the linker kept.
 isa() {
     enter
     local tag
@@ -57,12 +57,12 @@ lint() {
     enter
     requirements_of dev > "$ci/dev.txt"
     pip install --quiet -r "$ci/dev.txt"
-    pip install --quiet --no-deps gsplat==1.5.3  # the witness of the golden projections; its dependencies are not needed
+    pip install --quiet --no-deps gsplat==1.5.3  # the reference of the tested projections; it needs no dependencies here
     pre-commit run --all-files --show-diff-on-failure
 }
 
-# Without CUDA, with the C++ example that tests/system/test_cpp_example.py runs. CXX names the compiler, V3DG_WERROR=ON
-# makes its warnings errors, V3DG_CUDA=ON compiles the CUDA half, too.
+# Compiles the module and the C++ example that tests/system/test_cpp_example.py runs. CXX is the name of the compiler.
+# V3DG_WERROR=ON treats its warnings as errors; V3DG_CUDA=ON also compiles the CUDA sources.
 compile() {
     if [ -d "$ci/venv" ]; then enter; else environment; fi
     pip install --quiet cmake ninja 'pybind11>=2.13'
@@ -78,7 +78,7 @@ docs() {
     NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 }
 
-# Runs the second half of the README's command and keeps how long each test took.
+# Runs the second half of the README's test command, and records the duration of each test.
 run_tests() {
     enter
     local status=0
@@ -89,7 +89,7 @@ run_tests() {
 
 tests() { run_tests tests; }
 
-# All but the slow kinds of tests.
+# Runs all tests except those that are marked slow.
 fast_tests() { run_tests fast "-m 'not slow'"; }
 
 evaluation() {

@@ -1,16 +1,21 @@
 """What the site takes from elsewhere in the repository: pages from its root, recorded
-pictures, and the command line's options from its parser."""
+pictures, the tutorial from its notebook, and the command line's options from its
+parser. Beside the pages it writes llms.txt, an index of them for programs."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import warnings
 from pathlib import Path
 from typing import Any
 
 import tyro
+from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.nav import Navigation, Section
+from mkdocs.structure.pages import Page
 
 from v3dg.cli import COMMANDS
 
@@ -22,8 +27,14 @@ PAGES = {
 }
 
 
+NOTEBOOK = "notebooks/tutorial.ipynb"
+TUTORIAL = "tutorial.md"
+
+
 def on_files(files: Files, config: Any) -> Files:
     """Add pages and pictures that are not in docs/."""
+    notebook = json.loads((ROOT / "docs" / NOTEBOOK).read_text(encoding="utf-8"))
+    files.append(File.generated(config, TUTORIAL, content=notebook_text(notebook)))
     for source, page in PAGES.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         for other, target in PAGES.items():
@@ -51,6 +62,65 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
     if page.file.src_uri not in ("command_line.md", "python.md"):
         return html
     return re.sub(r"\bdocs/(\w+)\.md\b", r'<a href="\1.html">\1</a>', html)
+
+
+def on_page_context(
+    context: dict[str, Any], page: Page, config: MkDocsConfig, nav: Navigation
+) -> dict[str, Any]:
+    """Write the text of a page beside its HTML, and with the first page llms.txt
+    (llmstxt.org): by then all pages are read."""
+    site = Path(config.site_dir)
+    text = site / page.file.src_uri
+    text.parent.mkdir(parents=True, exist_ok=True)
+    text.write_text(page.markdown or "", encoding="utf-8")
+    if page.is_homepage:
+        (site / "llms.txt").write_text(llms_text(nav, config), encoding="utf-8")
+    return context
+
+
+def llms_text(nav: Navigation, config: MkDocsConfig) -> str:
+    """An index of the site for programs: a section for each of the navigation, and
+    a line for each page."""
+    lines = [f"# {config.site_name}", "", f"> {config.site_description}"]
+    for item in nav.items:
+        if isinstance(item, Section):
+            lines += ["", f"## {item.title}", "", *llms_links(item)]
+    return "\n".join(lines) + "\n"
+
+
+def llms_links(section: Section) -> list[str]:
+    """A line for each page of a section and of the sections in it."""
+    lines = []
+    for item in section.children:
+        if isinstance(item, Section):
+            lines += llms_links(item)
+        elif isinstance(item, Page):
+            sentence = first_sentence(item.markdown or "")
+            lines.append(f"- [{item.title}]({item.file.src_uri}): {sentence}")
+    return lines
+
+
+def first_sentence(markdown: str) -> str:
+    """The first sentence of the first paragraph of prose, without its markup."""
+    prose = re.sub(r"^```.*?^```$|<!--.*?-->", "", markdown, flags=re.M | re.S)
+    for paragraph in re.split(r"\n\s*\n", prose):
+        if re.match(r"[A-Za-z*`\[]", paragraph):
+            text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(paragraph.split()))
+            return re.split(r"(?<=[.:]) (?=[A-Z])", text.replace("**", ""), maxsplit=1)[0]
+    return ""
+
+
+def notebook_text(notebook: dict[str, Any]) -> str:
+    """A notebook as a page, without what its cells print."""
+    parts = []
+    for cell in notebook["cells"]:
+        text = "".join(cell["source"])
+        parts.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text)
+    link = (
+        f"This page is [a notebook]({NOTEBOOK}): download it, and open it in Jupyter or "
+        "upload it to a hosted notebook."
+    )
+    return "\n\n".join([parts[0], link, *parts[1:]]) + "\n"
 
 
 def command_text(name: str) -> str:

@@ -1,4 +1,4 @@
-"""How far apart two answers may be, each bound with its reason; and the comparisons
+"""Bounds for the difference of two results, each with its reason, and the comparisons
 that use them."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Bound:
-    """|got - expected| <= absolute + relative * |expected|, element by element."""
+    """For each element: |got - expected| <= absolute + relative * |expected|."""
 
     relative: float
     absolute: float
@@ -33,15 +33,16 @@ class PictureBound:
     band: float
     share: float
     reason: str
-    # A gaussian more or less at 1/255 changes a pixel by 1/255 of the colours' range
-    # (up to 4 here); one more or less where a pixel stops by the transmittance before
-    # it, at most 1e-4 / (1 - 0.999).
+    # One more or one fewer gaussian with an alpha near 1/255 changes a pixel by at most
+    # 1/255 of the range of colours, which is up to 4 here. If a pixel stops one
+    # gaussian earlier or later, it changes by at most the transmittance before this
+    # gaussian, 1e-4 / (1 - 0.999).
     flip: float = 0.4
 
 
 @dataclass(frozen=True)
 class GradientBound:
-    """Relative L2 distance and cosine over one whole input."""
+    """Bounds for the relative L2 distance and the cosine over one whole input."""
 
     relative_l2: float
     cosine: float

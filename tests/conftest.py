@@ -1,16 +1,17 @@
-"""What all tests share: both devices, Chromium, and a small bundle for the viewer.
+"""Fixtures and settings of all tests: both devices, Chromium, and a small bundle for
+the viewer.
 
-Tests stand in the folder of their kind:
+Each test is in the folder of its kind:
 
-    unit     one module or operation in this process; named after what it tests
-    files    formats and places of files: reading, writing, and what is refused
-    system   commands, servers, pools, threads and builds at work as a whole
+    unit     one module or operation in this process; files have the names of modules
+    files    file formats and places of files: reading, writing, and refused files
+    system   whole commands, servers, pools, threads and builds
     browser  pages in Chromium
     attack   hostile input, and programs that are stopped at any moment
-    docs     the tree, the types and the pages say what is true
+    docs     the source tree, the types and the pages are correct
 
-Those of `system`, `browser` and `attack` are slow: `pytest -m "not slow"` leaves them
-out, and with them single tests elsewhere that take more than a few seconds.
+Tests in `system`, `browser` and `attack` are marked slow, and so are tests elsewhere
+that take more than a few seconds. `pytest -m "not slow"` leaves them out.
 """
 
 import gc
@@ -25,21 +26,20 @@ import scenes_lod
 from v3dg import _device
 from v3dg.viewer.frame import SceneView
 
-# A shared machine can stall for longer than any deadline that would still mean
-# something.
+# A shared machine can stall for longer than any useful deadline.
 settings.register_profile("v3dg", deadline=None, print_blob=True)
 settings.load_profile("v3dg")
 
 
 @pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
-    """Each device in turn; devices.py brings arrays there and back."""
+    """Each device in turn. devices.py has functions that copy arrays to it and back."""
     return request.param
 
 
 @pytest.fixture(scope="module")
 def browser():
-    """Chromium, for tests that ask for playwright and skip without it."""
+    """Chromium, for tests that use playwright. They are skipped if it is missing."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as play:
@@ -50,21 +50,21 @@ def browser():
 
 @pytest.fixture(scope="session")
 def blob_bundle():
-    """A small bundle, for the viewer's tests."""
+    """A small bundle for the tests of the viewer."""
     rng = np.random.default_rng(0)
     return scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 3000, size=0.5), 64)
 
 
 @pytest.fixture(scope="session")
 def blob_view(blob_bundle):
-    """What the viewer draws of it, on the CPU."""
+    """The part of the viewer that draws this bundle, on the CPU."""
     return SceneView(blob_bundle, device="cpu")
 
 
 @pytest.fixture(scope="module")
 def collected_connections():
-    """No connection that a module's tests left to the collector is there in the tests
-    after them."""
+    """Collects garbage after each module, so that connections that its tests left open
+    do not reach the tests of the next module."""
     yield
     gc.collect()
 

@@ -36,7 +36,15 @@ from v3dg.panorama import draw_panorama
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize
 from v3dg.refine import refine_bundle
-from v3dg.render import BatchPlanes, RenderedBatch, Renderer, first_camera, render
+from v3dg.render import (
+    MESH,
+    BatchPlanes,
+    MeshLayer,
+    RenderedBatch,
+    Renderer,
+    first_camera,
+    render,
+)
 from v3dg.scan import Scan, scan
 from v3dg.scene import Scene
 from v3dg.scene.file import read_scene, write_scene
@@ -65,7 +73,7 @@ __all__ += [
     "Renderer",
     "Stats",
 ]
-__all__ += ["BatchPlanes", "CameraBatch", "RenderedBatch"]
+__all__ += ["MESH", "BatchPlanes", "CameraBatch", "MeshLayer", "RenderedBatch"]
 __all__ += ["draw_panorama", "first_camera"]
 __all__ += ["EquirectangularCamera", "Lidar", "Scan", "scan"]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]

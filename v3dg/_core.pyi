@@ -496,6 +496,52 @@ class FrameStats:
     @property
     def num_draws(self) -> int: ...
 
+class Channels:
+    """The channels of a picture (H, W) or of a batch (B, H, W); None where not
+    requested. `clipped` is uint8, ids are int32."""
+
+    @property
+    def median_depth(self) -> Array | None: ...
+    @property
+    def normal(self) -> Array | None: ...
+    @property
+    def instance(self) -> Array | None: ...
+    @property
+    def label(self) -> Array | None: ...
+    @property
+    def weight(self) -> Array | None: ...
+    @property
+    def clipped(self) -> Array | None: ...
+
+class Mesh:
+    """The z-buffer of a picture of meshes, or of a batch of pictures; borrows the
+    arrays, whose values are not checked.
+
+    Args:
+        color: (..., 3).
+        depth, coverage: (...).
+        normal: (..., 3) of length 1 or 0, or None.
+        instance, label: (...), or None.
+        is_linear: Whether colours are in linear light.
+    """
+
+    def __init__(
+        self,
+        *,
+        color: Array,
+        depth: Array,
+        coverage: Array,
+        normal: Array | None = None,
+        instance: Array | None = None,
+        label: Array | None = None,
+        is_linear: bool = False,
+    ) -> None: ...
+
+class Sensor:
+    """The channels and the meshes of a request."""
+
+    def __init__(self, channels: list[str], mesh: Mesh | None = None) -> None: ...
+
 class Picture:
     """The planes of a picture."""
 
@@ -505,6 +551,8 @@ class Picture:
     def alpha(self) -> Array: ...
     @property
     def depth(self) -> Array | None: ...
+    @property
+    def channels(self) -> Channels: ...
 
 class Drawing:
     """A frame that has been drawn, or enqueued on a device."""
@@ -515,6 +563,8 @@ class Drawing:
     def alpha(self) -> Array: ...
     @property
     def depth(self) -> Array | None: ...
+    @property
+    def channels(self) -> Channels: ...
     @property
     def right(self) -> Picture: ...
     def finish(self) -> FrameStats: ...
@@ -553,6 +603,7 @@ class ResidentScene:
         scales: Array,
         factors: Float32 | None = None,
         environments: Int32 | None = None,
+        labels: Int32 | None = None,
     ) -> None: ...
     def set_poses(self, positions: Array, quaternions: Array, scales: Array) -> None: ...
     def select(
@@ -721,6 +772,8 @@ class Batch:
     def alpha(self) -> Array | None: ...
     @property
     def depth(self) -> Array | None: ...
+    @property
+    def channels(self) -> Channels: ...
     def finish(self) -> None: ...
     def stats(self) -> BatchStats: ...
 
@@ -767,6 +820,7 @@ class FrameRequest:
             metrics.
         cut: A cut that is drawn instead of a selected one.
         look: The colours that the picture shows; None for the frame's own colours.
+        sensor: Channels beside colour, and meshes; None for neither.
     """
 
     def __init__(
@@ -776,6 +830,7 @@ class FrameRequest:
         shade: Shade | None = None,
         cut: GivenCut | None = None,
         look: Look | None = None,
+        sensor: Sensor | None = None,
     ) -> None: ...
 
 class Pick:
@@ -811,6 +866,7 @@ class SceneFrame:
         rule: Rule,
         shade: Shade,
         planes: BatchPlanes | None = None,
+        sensor: Sensor | None = None,
     ) -> Batch: ...
     def pick(
         self, scene: ResidentScene, request: FrameRequest, pool: PagePool | None = None
@@ -823,7 +879,13 @@ class AssetFrame:
     def __init__(
         self, model: Model, *, filter_px2: float = 0.0, antialiased: bool = False
     ) -> None: ...
-    def draw(self, camera: Camera, shade: Shade, stop: Stop | None = None) -> Drawing: ...
+    def draw(
+        self,
+        camera: Camera,
+        shade: Shade,
+        stop: Stop | None = None,
+        sensor: Sensor | None = None,
+    ) -> Drawing: ...
 
 class FitConfig:
     """The settings of a fit. All of them are required."""

@@ -1,13 +1,28 @@
 """Pictures as results of drawing, and their statistics."""
 
 import os
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from v3dg import _core
 from v3dg.gaussians import Array
 from v3dg.pictures import encode_png, write_picture
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelPlanes:
+    """The channels of a picture beside colour; None unless requested."""
+
+    median_depth: Array | None
+    normal: Array | None
+    instance: Array | None
+    label: Array | None
+    weight: Array | None
+    clipped: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,9 +32,66 @@ class Planes:
     color: Array
     alpha: Array
     depth: Array | None
+    channels: ChannelPlanes | None = None
 
 
-class Image:
+class Sensed:
+    """The channels of one picture (H, W), or of a batch (B, H, W), that
+    `channels` requested; docs/sensors.md defines them. A channel that was not requested
+    raises AttributeError.
+
+    Attributes:
+        median_depth: (...) depth of the gaussian behind which at most half of the light
+            is left; 0 where more passes.
+        normal: (..., 3) blended normal in the axes of the camera (x right, y down, z
+            forward), of length 1, or 0 where nothing is drawn.
+        instance: (...) int32, the instance with the largest weight in the pixel; -1
+            where nothing is drawn, `v3dg.MESH` for a mesh without ids.
+        label: (...) int32, the label of that instance; -1 for none.
+        weight: (...) that weight, 0 to 1.
+        clipped: (...) bool, whether a gaussian is missing because its centre is before
+            the near plane, while its body extends into the view.
+    """
+
+    @property
+    @abstractmethod
+    def _channels(self) -> ChannelPlanes | _core.Channels | None: ...
+
+    @property
+    def median_depth(self) -> Array:
+        return _requested("median_depth", self._channels and self._channels.median_depth)
+
+    @property
+    def normal(self) -> Array:
+        return _requested("normal", self._channels and self._channels.normal)
+
+    @property
+    def instance(self) -> Array:
+        return _requested("instance", self._channels and self._channels.instance)
+
+    @property
+    def label(self) -> Array:
+        return _requested("label", self._channels and self._channels.label)
+
+    @property
+    def weight(self) -> Array:
+        return _requested("weight", self._channels and self._channels.weight)
+
+    @property
+    def clipped(self) -> Array:
+        clipped = _requested("clipped", self._channels and self._channels.clipped)
+        return clipped.view(np.bool_)
+
+
+def _requested(name: str, plane: Array | None) -> Array:
+    if plane is None:
+        raise AttributeError(
+            f"{name}: expected pictures that were drawn with channels=({name!r},), got others"
+        )
+    return plane
+
+
+class Image(Sensed):
     """A picture of H x W pixels: NumPy arrays, or torch tensors on the device that drew
     it.
 
@@ -37,6 +109,10 @@ class Image:
     @property
     def _planes(self) -> Planes | _core.Drawing | _core.Picture:
         return self._drawn
+
+    @property
+    def _channels(self) -> ChannelPlanes | _core.Channels | None:
+        return self._planes.channels
 
     def _repr_png_(self) -> bytes:
         """Return the picture as PNG for notebooks."""

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Literal, TypeAlias, TypeVar, get_args
 
 from v3dg._numbers import check, check_type, one_of
-from v3dg._urls import FileAtUrl, beside, folder_of, in_parts, reading, shown
+from v3dg._urls import FileAtUrl, beside, folder_of, in_parts, is_url, reading, shown
 from v3dg.cameras import AXES, Axis
 from v3dg.cleaning import AssetWarning, coarse_note
 from v3dg.formats import (
@@ -80,6 +80,9 @@ _PACKED: dict[str, Limits] = {
     ".sog": Limits(),
 }
 
+# Files of formats that consist of a folder; the first one describes the whole folder.
+_FOLDER_INDICES = ("lod-meta.json", "meta.json")
+
 # Checkpoints of gsplat (one for each GPU) and of nerfstudio, and the files that the
 # code of the 3DGS paper writes.
 _RUNS = (
@@ -95,12 +98,33 @@ WRITE_SUFFIXES = tuple(_WRITERS)
 """The ends of file names that `write_asset` accepts."""
 
 
+def asset_file(path: AnyPath) -> AnyPath:
+    """Return the file that describes the asset in a folder: its `lod-meta.json`, or
+    else its `meta.json`. A path of anything else is returned unchanged."""
+    if is_url(path):
+        return path
+    for name in _FOLDER_INDICES:
+        index = pathlib.Path(path) / name
+        if index.is_file():
+            return index
+    return path
+
+
+def is_asset_by_content(path: AnyPath) -> bool:
+    """Return whether a local file's content shows an asset of a format that can be read
+    whatever the name of the file is."""
+    content = content_of(path)
+    # USD chooses the encoding by the suffix.
+    return content is not None and content.suffix not in ("", *usd.SUFFIXES)
+
+
 def subject_name(path: AnyPath) -> str:
     """Return the name of the subject in a file or at a URL: the file's name without its
     suffix. For a file whose name is always the same, such as `lod-meta.json`, it is the
     name of the folder."""
+    path = asset_file(path)
     file = beside(path)
-    if file.name.lower() in ("lod-meta.json", "meta.json"):
+    if file.name.lower() in _FOLDER_INDICES:
         folder = folder_of(path)
         if folder:
             return folder
@@ -130,8 +154,9 @@ def read_asset(path: AnyPath) -> Gaussians:
       splatfacto and of the code of the 3DGS paper and 2DGS. Only tensors are read; no
       code of the pickle is run.
 
-    If the content of a file has another of these formats than its name, the content
-    determines the format.
+    If the content of a file has another of these formats than its name, or its name has
+    no known end, the content determines the format. Of a folder, its `lod-meta.json` or
+    `meta.json` is read.
 
     If the file declares whether the gaussians were trained with antialiasing,
     `Gaussians.antialiased` of the result has that value.
@@ -175,12 +200,24 @@ def open_asset(path: AnyPath) -> AssetFile:
     `.ply`, `.splat` and `.compressed.ply` are read row by row. For other formats, the
     first read loads all rows.
     """
+    path = asset_file(path)
+    reader = _of_name(path, _READERS)
+    if reader is None and not is_url(path) and is_asset_by_content(path):
+        return _open_unnamed(path)
     reader = _by_name(path, _READERS)
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
         return _open_fetched(at_url, reader)
     reader, notes = _by_content(at_url, reader)
     return _noted(reader(at_url), notes)
+
+
+def _open_unnamed(path: AnyPath) -> AssetFile:
+    """Open a file whose name has no known end, with the reader for its content."""
+    content = content_of(path)
+    assert content is not None
+    note = f"The end of its name is unknown; the file is {content.text} and was read as such."
+    return _noted(_READERS[content.suffix](path), (note,))
 
 
 def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...]]:
@@ -192,9 +229,7 @@ def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...
         return reader, ()
     name = beside(path).name.lower()
     ending = next(ending for ending in _READERS if name.endswith(ending))
-    # USD chooses the encoding by the suffix.
-    is_readable = content.suffix not in ("", *usd.SUFFIXES)
-    check(path, is_readable, f"a {ending}, got {content.text}")
+    check(path, is_asset_by_content(path), f"a {ending}, got {content.text}")
     note = f"The name ends in {ending}, but the file is {content.text}; it was read as such."
     return _READERS[content.suffix], (note,)
 
@@ -248,6 +283,7 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
 def asset_bytes(path: AnyPath) -> int:
     """Return the size in bytes of a readable asset, including all existing files to
     which it refers."""
+    path = asset_file(path)
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):

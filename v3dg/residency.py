@@ -132,6 +132,7 @@ class ResidentScene:
                 scales,
                 scene.factors,
                 scene.environments,
+                scene.labels,
             )
         self.revision = scene.revision
 

@@ -208,8 +208,10 @@ class Frame {
 class AssetFrame {
   public:
     virtual ~AssetFrame() = default;
-    // Like Frame::draw(), for one camera.
+    // Like Frame::draw(), for one camera. Unless draws_only_plainly, `sensor` may have
+    // channels and meshes.
     virtual std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
+                                               const SensorRequest& sensor,
                                                const std::atomic<bool>* stop) = 0;
 };
 

@@ -8,6 +8,7 @@
 
 #include "bindings/array.h"
 #include "bindings/drawing.h"
+#include "bindings/sensor.h"
 #include "bindings/types.h"
 #include "frame/image.h"
 
@@ -110,6 +111,7 @@ class BoundBatch {
     }
 
     py::object color, alpha, depth;  // as in BoundPlanes
+    NewChannels channels;
 
   private:
     py::object kept_;  // destroyed after the members of a derived class

@@ -161,6 +161,7 @@ void bind_batch(py::module_& m) {
         .def_readonly("color", &BoundBatch::color)
         .def_readonly("alpha", &BoundBatch::alpha)
         .def_readonly("depth", &BoundBatch::depth)
+        .def_readonly("channels", &BoundBatch::channels)
         .def("finish", &BoundBatch::finish, "Waits for the pictures.")
         .def("stats", &BoundBatch::stats);
 }

@@ -66,23 +66,48 @@ struct BoundLook {
     bool is_aside = false;
 };
 
+// Throws ValueError if the channel `clipped` is requested for another camera than a
+// pinhole.
+void check_clipped(const SensorRequest& request, const Camera& camera) {
+    if (request.channels.clipped && !camera.is_pinhole())
+        throw py::value_error(
+            "channels: 'clipped' is defined for pinholes, got a camera with another lens; leave "
+            "it out");
+}
+
+// Returns the request for channels and meshes in pictures of these eyes. `sensor` is a
+// BoundSensor or None.
+SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes) {
+    if (sensor.is_none()) return {};
+    const Window window = window_of(eyes.camera[0]);
+    const SensorRequest request =
+        held<BoundSensor>(sensor, "sensor").request(kHost, {window.height(), window.width()});
+    if (request.mesh.is_there() && eyes.are_two)
+        throw py::value_error("mesh: expected one camera, got two eyes; draw each eye separately");
+    check_clipped(request, eyes.camera[0]);
+    return request;
+}
+
 // A request. The given cut and the colours of clusters are separate, because only a
 // frame can check them.
 struct BoundRequest {
     FrameRequest plain;
     std::optional<BoundGivenCut> cut;
     py::object cluster_colors;  // see BoundLook; null if there is none
+    py::object sensor;          // BoundSensor or None; owns the arrays of the mesh
 
     // `camera` is a Camera or an Eyes. A test in the constructor is faster than
     // overloads or implicit conversions, which would take most of the constructor's
     // time.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
-                 const BoundGivenCut* given, const BoundLook* look)
+                 const BoundGivenCut* given, const BoundLook* look, py::object channels)
         : plain{.eyes = eyes_of(camera),
                 .rule = rule == nullptr ? SelectRule{} : *rule,
                 .shade = shade == nullptr ? Shade{} : *shade},
-          cluster_colors(look == nullptr ? py::object() : py::object(look->cluster_colors)) {
+          cluster_colors(look == nullptr ? py::object() : py::object(look->cluster_colors)),
+          sensor(std::move(channels)) {
         check_footprint(plain.eyes, plain.rule);
+        plain.sensor = sensor_of(sensor, plain.eyes);
         if (given != nullptr && plain.eyes.are_two)
             throw py::value_error(
                 "cut: expected one camera, got two eyes; draw each eye separately");
@@ -113,6 +138,13 @@ struct BoundRequest {
         return request;
     }
 };
+
+// Throws ValueError if the device cannot draw channels and meshes, but is asked to.
+void check_sensor(Device device, const SensorRequest& sensor) {
+    if (sensor.is_on() && backend_of(device).traits.draws_only_plainly)
+        throw py::value_error(
+            "channels, mesh: supported only on the CPU so far; draw with device='cpu'");
+}
 
 // Draws scenes on one device. The frame's models belong to the bundles of the scenes,
 // in order; a scene may have fewer bundles.
@@ -173,7 +205,8 @@ class BoundSceneFrame {
     // caller or into new planes.
     std::unique_ptr<BoundBatch> draw_batch(const py::object& scene_object,
                                            const py::object& cameras_object, const SelectRule& rule,
-                                           const Shade& shade, const BoundPlanes* planes) {
+                                           const Shade& shade, const BoundPlanes* planes,
+                                           const py::object& sensor_object) {
         const BoundScene& scene = checked(scene_object);
         const auto& cameras = held<BoundCameras>(cameras_object, "cameras");
         if (cameras.device() != device_)
@@ -186,14 +219,19 @@ class BoundSceneFrame {
         std::optional<BoundPlanes> new_planes;
         if (planes == nullptr) planes = &new_planes.emplace(cameras, device_, shade.with_depth);
         planes->check(cameras, device_);
+        NewChannels channels;
+        const Sensor sensor = sensor_of_batch(sensor_object, cameras, channels);
         const BatchRequest request{.rule = rule,
                                    .shade = shade,
                                    .width = cameras.width(),
                                    .height = cameras.height(),
-                                   .planes = planes->planes()};
+                                   .planes = planes->planes(),
+                                   .sensor = sensor};
         std::unique_ptr<BoundBatch> batch = frame_->draw_batch(
             {.request = request, .cameras = cameras, .scene = scene.handle(), .state = state});
-        batch->keep(py::make_tuple(py::cast(this), scene_object, cameras_object), *planes);
+        batch->keep(py::make_tuple(py::cast(this), scene_object, cameras_object, sensor_object),
+                    *planes);
+        batch->channels = channels;
         return batch;
     }
 
@@ -221,6 +259,19 @@ class BoundSceneFrame {
     }
 
   private:
+    // Returns the meshes and new planes for the channels of a batch.
+    Sensor sensor_of_batch(const py::object& sensor, const BoundCameras& cameras,
+                           NewChannels& channels) const {
+        if (sensor.is_none()) return {};
+        const std::vector<py::ssize_t> shape{static_cast<py::ssize_t>(cameras.size()),
+                                             cameras.height(), cameras.width()};
+        const SensorRequest request = held<BoundSensor>(sensor, "sensor").request(kHost, shape);
+        check_sensor(device_, request);
+        for (const Camera& camera : cameras.lenses()) check_clipped(request, camera);
+        return {.planes = channels.allocate(device_, request.channels, shape),
+                .mesh = request.mesh};
+    }
+
     // Throws ValueError if a camera on the host has an environment that the scene does
     // not have.
     static void check_environments(const BoundCameras& cameras, const EnvironmentTable& table) {
@@ -249,6 +300,7 @@ class BoundSceneFrame {
         const FrameRequest& request = completed ? *completed : bound.plain;
         if (has_pool && request.cut)
             throw py::value_error("cut: a pool selects its own cut; leave out `cut`");
+        check_sensor(device_, request.sensor);
         if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
             throw py::value_error(
                 "shows, colors, chooser, aside: these are supported only on the CPU; leave "
@@ -303,19 +355,24 @@ class BoundAssetFrame {
         const auto& model = held<BoundModel>(model_object, "model");
         if (model.has_codes())
             throw py::value_error("model: expected float32 gaussians, got quantized ones");
-        const Work work(model.device());
+        device_ = model.device();
+        const Work work(device_);
         const Appearance<float> appearance{filter_px2, antialiased, false};
         frame_ = work.backend().make_asset_frame(model.handle(), appearance, work);
     }
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
-                                       const Stop* stop) {
-        std::unique_ptr<BoundDrawing> drawing = frame_->draw(camera.camera, shade, flag_of(stop));
+                                       const Stop* stop, const py::object& sensor_object) {
+        const SensorRequest sensor = sensor_of(sensor_object, camera.camera);
+        check_sensor(device_, sensor);
+        std::unique_ptr<BoundDrawing> drawing =
+            frame_->draw(camera.camera, shade, sensor, flag_of(stop));
         if (drawing->is_under_way()) drawing->keep(py::cast(this));
         return drawing;
     }
 
   private:
+    Device device_;
     std::unique_ptr<backend::AssetFrame> frame_;
 };
 
@@ -353,11 +410,14 @@ void bind_frame(py::module_& m) {
     py::class_<NewPicture>(m, "Picture", "A drawn picture: arrays of colour, alpha and depth.")
         .def_readonly("color", &NewPicture::color)
         .def_readonly("alpha", &NewPicture::alpha)
-        .def_readonly("depth", &NewPicture::depth);
+        .def_readonly("depth", &NewPicture::depth)
+        .def_readonly("channels", &NewPicture::channels);
     py::class_<BoundDrawing>(m, "Drawing", "A frame that has been drawn, or enqueued on a device.")
         .def_property_readonly("color", [](const BoundDrawing& d) { return d.picture().color; })
         .def_property_readonly("alpha", [](const BoundDrawing& d) { return d.picture().alpha; })
         .def_property_readonly("depth", [](const BoundDrawing& d) { return d.picture().depth; })
+        .def_property_readonly("channels",
+                               [](const BoundDrawing& d) { return d.picture().channels; })
         .def_property_readonly("right", &BoundDrawing::right,
                                "The picture of the right eye, if there are two eyes.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy,
@@ -382,9 +442,9 @@ void bind_frame(py::module_& m) {
              "aside"_a = false);
     py::class_<BoundRequest>(m, "FrameRequest", "The request for one picture.")
         .def(py::init<const py::object&, const SelectRule*, const Shade*, const BoundGivenCut*,
-                      const BoundLook*>(),
+                      const BoundLook*, py::object>(),
              "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
-             "look"_a = nullptr);
+             "look"_a = nullptr, "sensor"_a = py::none());
     py::class_<ScenePick>(m, "Pick", "The gaussian with the largest blend weight in a pixel.")
         .def_readonly("instance", &ScenePick::instance)
         .def_readonly("cluster", &ScenePick::cluster)
@@ -396,7 +456,7 @@ void bind_frame(py::module_& m) {
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "request"_a, "pool"_a = py::none(),
              "steps"_a = nullptr, "stop"_a = nullptr)
         .def("draw_batch", &BoundSceneFrame::draw_batch, "scene"_a, "cameras"_a, "rule"_a,
-             "shade"_a, "planes"_a = nullptr)
+             "shade"_a, "planes"_a = nullptr, "sensor"_a = py::none())
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
              "Returns the bytes of the frame on a CUDA device, by part, and the bytes of the "
@@ -404,7 +464,8 @@ void bind_frame(py::module_& m) {
     py::class_<BoundAssetFrame>(m, "AssetFrame", "Draws gaussians without levels on their device.")
         .def(py::init<py::object, float, bool>(), "model"_a, py::kw_only(), "filter_px2"_a = 0.0f,
              "antialiased"_a = false)
-        .def("draw", &BoundAssetFrame::draw, "camera"_a, "shade"_a, "stop"_a = nullptr);
+        .def("draw", &BoundAssetFrame::draw, "camera"_a, "shade"_a, "stop"_a = nullptr,
+             "sensor"_a = py::none());
 }
 
 }  // namespace v3dg

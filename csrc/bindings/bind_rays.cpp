@@ -20,7 +20,7 @@ Span<const double> angles_of(const Doubles& angles, const char* name, double mos
 }
 
 // A sensor at one pose.
-struct BoundSensor {
+struct BoundRaySensor {
     Camera camera;
     RayGrid grid;
     RayLimits limits;
@@ -69,7 +69,7 @@ const host::HostModel& host_model(const py::handle& item) {
     return static_cast<const host::HostModel&>(*model.handle());
 }
 
-BoundCast cast_scene(const BoundScene& scene, const py::list& models, const BoundSensor& sensor,
+BoundCast cast_scene(const BoundScene& scene, const py::list& models, const BoundRaySensor& sensor,
                      const SelectRule& rule, const GivenRule& returns) {
     check_is_on_host(scene.device(), "scene", "expected a scene on the CPU, got one on a device");
     if (rule.budget != kNoBudget)
@@ -107,7 +107,7 @@ BoundCast cast_scene(const BoundScene& scene, const py::list& models, const Boun
     return made;
 }
 
-BoundCast cast_model(const BoundModel& bound, const BoundSensor& sensor, float filter_px2,
+BoundCast cast_model(const BoundModel& bound, const BoundRaySensor& sensor, float filter_px2,
                      bool antialiased, const GivenRule& returns) {
     const host::HostModel& model = host_model(py::cast(bound, py::return_value_policy::reference));
     if (model.planes() == nullptr)
@@ -130,15 +130,15 @@ BoundCast cast_model(const BoundModel& bound, const BoundSensor& sensor, float f
 }  // namespace
 
 void bind_rays(py::module_& m) {
-    py::class_<BoundSensor>(m, "RaySensor",
-                            "A sensor at one pose: rays of ascending azimuths and elevations. "
-                            "The camera has x forward, y left and z up.")
+    py::class_<BoundRaySensor>(m, "RaySensor",
+                               "A sensor at one pose: rays of ascending azimuths and elevations. "
+                               "The camera has x forward, y left and z up.")
         .def(
             py::init([](const BoundCamera& camera, const Doubles& azimuth, const Doubles& elevation,
                         float far, float spacing, float min_transmittance) {
                 const Span<const double> columns = angles_of(azimuth, "azimuth", 2 * kPi);
                 const Span<const double> rows = angles_of(elevation, "elevation", kPi / 2);
-                return BoundSensor{
+                return BoundRaySensor{
                     .camera = camera.camera,
                     .grid = RayGrid(columns, rows),
                     .limits = {.nearest = static_cast<float>(camera.camera.near_depth),

@@ -74,7 +74,8 @@ void bind_scene(py::module_& m) {
         .def(py::init<int>(), "device"_a)
         .def("set_bundles", &BoundScene::set_bundles, "tables"_a)
         .def("set_instances", &BoundScene::set_instances, "bundle"_a, "importance"_a, "positions"_a,
-             "quaternions"_a, "scales"_a, "factors"_a = py::none(), "environments"_a = py::none())
+             "quaternions"_a, "scales"_a, "factors"_a = py::none(), "environments"_a = py::none(),
+             "labels"_a = py::none())
         .def("set_poses", &BoundScene::set_poses, "positions"_a, "quaternions"_a, "scales"_a)
         .def("select", &BoundScene::select, "camera"_a, "rule"_a, "steps"_a = nullptr)
         .def("page_needs", &BoundScene::page_needs, "camera"_a, "rule"_a,

@@ -345,7 +345,7 @@ class BackendAssetFrame final : public backend::AssetFrame {
         : device_(device), model_(std::move(model)), appearance_(appearance) {}
 
     std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
-                                       const std::atomic<bool>*) override {
+                                       const SensorRequest&, const std::atomic<bool>*) override {
         const Turn turn(*turns_);
         const Work work(device_);
         NewPictures pictures;

@@ -175,20 +175,27 @@ Picture<T> picture_in(NewPicture& made, const Window& window, const Shade& shade
             .min_transmittance = shade.min_transmittance};
 }
 
-// New pictures for the windows of the eyes.
+// New pictures for the windows of the eyes, and their channels.
 struct HostPictures {
     NewPictures made;
     std::vector<Picture<float>> pictures;
+    std::vector<Sensor> sensors;
 
-    HostPictures(const Eyes& eyes, const Shade& shade, FrameLook look = FrameLook::appearance) {
+    HostPictures(const Eyes& eyes, const Shade& shade, const SensorRequest& sensor,
+                 FrameLook look = FrameLook::appearance) {
         const bool counts = look == FrameLook::count;
         for (int k = 0; k < eyes.count(); ++k) {
             const Window window = window_of(eyes.camera[k]);
             made.emplace_back(window, shade.with_depth || counts);
             pictures.push_back(picture_in<float>(made.back(), window, shade));
             if (counts) std::swap(pictures.back().depth, pictures.back().count);
+            const std::vector<py::ssize_t> shape{window.height(), window.width()};
+            sensors.push_back(
+                {.planes = made.back().channels.allocate(kHost, sensor.channels, shape),
+                 .mesh = sensor.mesh});
         }
     }
+    Span<const Sensor> sensor_span() const { return {sensors.data(), sensors.size()}; }
     Span<const Picture<float>> span() const { return {pictures.data(), pictures.size()}; }
 };
 
@@ -245,7 +252,8 @@ class HostFrame final : public backend::Frame {
             if (given != nullptr) environment.assign(given, given + cameras.size());
             cpu::draw_batch(HostScene{.tables = {state.tables.data(), state.tables.size()},
                                       .models = {models.data(), models.size()},
-                                      .instances = state.instances},
+                                      .instances = state.instances,
+                                      .labels = state.label_span()},
                             input.request,
                             {.camera = {camera.data(), camera.size()},
                              .environment = {environment.data(), environment.size()},
@@ -272,12 +280,13 @@ class HostFrame final : public backend::Frame {
     std::unique_ptr<BoundDrawing> draw_paced(const backend::FrameInput& input,
                                              const SelectRule& paced, uint32_t* last_bin) const {
         const FrameRequest& request = input.request;
-        HostPictures out(request.eyes, request.shade, request.look);
+        HostPictures out(request.eyes, request.shade, request.sensor, request.look);
         SceneFrameCounts counts{};
         const PoolFrame kind = request.is_aside ? PoolFrame::aside : PoolFrame::flight;
         with_scene(input, paced, kind, last_bin,
                    [&](const HostScene& scene, const SelectRule& rule) {
-                       counts = cpu::draw_scene(scene, request, rule, out.span(), input.stop);
+                       counts = cpu::draw_scene(scene, request, rule, out.span(), out.sensor_span(),
+                                                input.stop);
                        return counts.exceeds_budget ? rule.tolerance_px2 : counts.tolerance_px2;
                    });
         return std::make_unique<BoundDrawing>(std::move(out.made), stats_of(counts));
@@ -299,7 +308,8 @@ class HostFrame final : public backend::Frame {
                                       .models = {models.data(), models.size()},
                                       .instances = state.instances,
                                       .needs = needs,
-                                      .last_bin = last_bin},
+                                      .last_bin = last_bin,
+                                      .labels = state.label_span()},
                             raised);
             });
             return;
@@ -310,7 +320,8 @@ class HostFrame final : public backend::Frame {
         body(HostScene{.tables = {state.tables.data(), state.tables.size()},
                        .models = {models.data(), models.size()},
                        .instances = state.instances,
-                       .last_bin = last_bin},
+                       .last_bin = last_bin,
+                       .labels = state.label_span()},
              rule);
     }
 
@@ -323,14 +334,15 @@ class HostAssetFrame final : public backend::AssetFrame {
         : model_(std::move(model)), appearance_(appearance) {}
 
     std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
+                                       const SensorRequest& sensor,
                                        const std::atomic<bool>* stop) override {
         const auto& model = static_cast<const HostModel&>(*model_);
-        HostPictures out(camera, shade);
+        HostPictures out(camera, shade, sensor);
         SceneFrameCounts counts;
         {
             const Unlocked unlocked;
             counts = cpu::draw_model(*model.planes(), model.size(), appearance_, camera,
-                                     out.pictures[0], stop);
+                                     out.pictures[0], out.sensors[0], stop);
         }
         return std::make_unique<BoundDrawing>(std::move(out.made), stats_of(counts));
     }

@@ -75,6 +75,7 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_rasterize(m);
     v3dg::bind_scene(m);
     v3dg::bind_pool(m);
+    v3dg::bind_sensor(m);
     v3dg::bind_batch(m);
     v3dg::bind_frame(m);
     v3dg::bind_rays(m);

@@ -2,6 +2,7 @@
 
 // The memory of a new picture.
 
+#include "bindings/sensor.h"
 #include "bindings/types.h"
 
 namespace v3dg {
@@ -15,6 +16,7 @@ struct NewPicture {
     py::ssize_t height, width;
     py::object color, alpha, depth;  // `depth` is None if not requested
     bool with_depth;
+    NewChannels channels;
 
     NewPicture(const Window& window, bool with_depth)
         : height(window.height()),

@@ -85,10 +85,18 @@ static std::vector<int32_t> environments_of(const py::object& environments, py::
     return {given.begin(), given.end()};
 }
 
+// Returns the label of each instance, or null for None.
+static std::shared_ptr<const std::vector<int32_t>> labels_of(const py::object& labels,
+                                                             py::ssize_t count) {
+    if (labels.is_none()) return nullptr;
+    const Span<const int32_t> given = span_of<const int32_t>(labels, "labels", {count});
+    return std::make_shared<std::vector<int32_t>>(given.begin(), given.end());
+}
+
 void BoundScene::set_instances(const py::array& bundle, const py::array& importance,
                                const py::object& positions, const py::object& quaternions,
                                const py::object& scales, const py::object& factors,
-                               const py::object& environments) {
+                               const py::object& environments, const py::object& labels) {
     auto state = std::make_shared<SceneState>(*state_);
     InstanceTable& instances = state->instances;
     instances.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
@@ -99,6 +107,7 @@ void BoundScene::set_instances(const py::array& bundle, const py::array& importa
     const std::vector<int32_t> environment = environments_of(environments, count);
     state->environments =
         std::make_shared<Environments>(Span<const int32_t>{environment.data(), environment.size()});
+    state->labels = labels_of(labels, count);
     state->arrays = py::make_tuple(bundle, importance, positions, quaternions, scales, factors);
     const Work work(device_);
     scene_->set_instances(*state, work);

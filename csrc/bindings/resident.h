@@ -62,6 +62,13 @@ struct SceneState {
     std::shared_ptr<const Environments> environments =
         std::make_shared<Environments>(Span<const int32_t>{});
 
+    // The label of each instance; null: no instance has a label.
+    std::shared_ptr<const std::vector<int32_t>> labels;
+
+    Span<const int32_t> label_span() const {
+        if (labels == nullptr) return {};
+        return {labels->data(), labels->size()};
+    }
     const BoundTable& bundle(size_t b) const { return held<BoundTable>(bundles[b], "tables"); }
 };
 
@@ -79,7 +86,7 @@ class BoundScene {
     void set_instances(const py::array& bundle, const py::array& importance,
                        const py::object& positions, const py::object& quaternions,
                        const py::object& scales, const py::object& factors,
-                       const py::object& environments);
+                       const py::object& environments, const py::object& labels);
     // Sets new poses of the same instances.
     void set_poses(const py::object& positions, const py::object& quaternions,
                    const py::object& scales);

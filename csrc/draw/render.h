@@ -7,6 +7,7 @@
 #include "frame/draw_list.h"
 #include "frame/image.h"
 #include "frame/record.h"
+#include "frame/sensor.h"
 #include "tile_bin/tile_bin.h"
 
 namespace v3dg {
@@ -25,6 +26,16 @@ struct Workspace {
     uint64_t room = 0;  // length of the used part of `records`, including gaps
     // Largest `room` so far, and thus the memory that was ever touched.
     uint64_t most_room = 0;
+    // For the sensor pass: the normal and the instance of each record.
+    Buffer<float> normals;
+    Buffer<int32_t> instances;
+};
+
+// The sensor of a picture, and the ids that its channels name.
+struct DrawnSensor {
+    Sensor sensor;
+    Span<const int32_t> instance_of_draw;   // [draws]
+    Span<const int32_t> label_of_instance;  // empty: no instance has a label
 };
 
 struct RenderCounts {
@@ -42,11 +53,12 @@ struct RenderCounts {
 // If `keep_source`, the picture is drawn in one band, and render_backward() can use the
 // workspace. `source` is then the index of each record's gaussian, counted over all
 // draws. If `stop` becomes true, the function returns soon; the picture and the counts
-// are then incomplete.
+// are then incomplete. With a sensor (only float), which may be null, its channels are
+// computed, and its meshes are mixed into the picture; not the channel `clipped`.
 template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Intrinsics<T>& camera,
                     const Picture<T>& picture, bool keep_source, Workspace<T>& workspace,
-                    const std::atomic<bool>* stop = nullptr);
+                    const std::atomic<bool>* stop = nullptr, const DrawnSensor* sensor = nullptr);
 
 // The gaussian with the largest blend weight in a pixel.
 struct Pick {

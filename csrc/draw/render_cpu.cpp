@@ -3,6 +3,7 @@
 
 #include "base/threads.h"
 #include "draw/render.h"
+#include "draw/sense.h"
 
 #include <omp.h>
 
@@ -12,6 +13,7 @@
 #include <numeric>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
 
 #include "base/clock.h"
 #include "base/parallel_for.h"
@@ -265,18 +267,33 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
     return part;
 }
 
+// Runs the sensor pass over a band that was drawn.
+static void sense(const std::vector<Draw<float>>& draws, const Picture<float>& picture,
+                  const Window& band, const DrawnSensor& sensor, Workspace<float>& ws,
+                  const std::atomic<bool>* stop) {
+    const size_t skip = static_cast<size_t>(band.y0 - picture.window.y0) *
+                        static_cast<size_t>(picture.window.width());
+    DrawnSensor part = sensor;
+    part.sensor = sensor.sensor.from(skip);
+    sense_band(draws, band_of(picture, band), part, ws, stop);
+}
+
 template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Intrinsics<T>& camera,
                     const Picture<T>& picture, bool keep_source, Workspace<T>& ws,
-                    const std::atomic<bool>* stop) {
+                    const std::atomic<bool>* stop, const DrawnSensor* sensor) {
     RenderCounts counts{};
+    const bool needs_source = keep_source || (sensor != nullptr && needs_source_of(*sensor));
     std::vector<Piece> pieces = pieces_of(draws);
     const std::vector<Window> bands = keep_source
                                           ? std::vector<Window>{picture.window}
                                           : bands_of(draws, pieces, camera, picture.window, stop);
-    for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b)
-        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws,
+    for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b) {
+        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), needs_source, ws,
                     stop, counts);
+        if constexpr (std::is_same_v<T, float>)
+            if (sensor != nullptr) sense(draws, picture, bands[b], *sensor, ws, stop);
+    }
     for (const Piece& piece : pieces) {
         counts.in_frustum += piece.reach.in_frustum;
         counts.records += piece.reach.drawn;
@@ -390,7 +407,7 @@ bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera
 #define V3DG_INSTANTIATE(T)                                                                   \
     template RenderCounts render<T>(const std::vector<Draw<T>>&, const Intrinsics<T>&,        \
                                     const Picture<T>&, bool, Workspace<T>&,                   \
-                                    const std::atomic<bool>*);                                \
+                                    const std::atomic<bool>*, const DrawnSensor*);            \
     template void render_backward<T>(const Draw<T>&, const Intrinsics<T>&, const Picture<T>&, \
                                      const PictureGradient<T>&, const Workspace<T>&,          \
                                      const GaussianRows<T>&, const CenterGradients<T>&, T*);

@@ -9,6 +9,7 @@
 
 #include "camera/camera.h"
 #include "frame/image.h"
+#include "frame/sensor.h"
 #include "select/select.h"
 
 namespace v3dg {
@@ -44,12 +45,15 @@ struct FrameRequest {
     // Per bundle: the colours of clusters in host memory, as SH coefficients of degree
     // 0, [C][3]. An empty vector keeps the gaussians' colours.
     std::vector<const float*> cluster_colors = {};
+    // Channels beside colour, and the meshes of the only eye.
+    SensorRequest sensor = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
     // Returns whether every backend can draw the request. Other requests are drawn on
     // the host only.
     bool is_plain() const {
-        return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
+        return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty() &&
+               !sensor.is_on();
     }
 };
 
@@ -60,6 +64,8 @@ struct BatchRequest {
     Shade shade;  // ignores `with_depth`: depth is drawn if there are planes for it
     int width, height;
     BatchPlanes planes;
+    // Channels and meshes of the pictures, one after another. Only on the host.
+    Sensor sensor = {};
 };
 
 }  // namespace v3dg

@@ -31,6 +31,10 @@ struct HostScene {
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
     Span<const ClusterRuns> runs = {};
+    // For the ids of a sensor: the label of each instance of the whole scene, empty if
+    // none has one; and, if `instances` are a part of that scene, their ids in it.
+    Span<const int32_t> labels = {};
+    Span<const int32_t> instance_ids = {};
 };
 
 // The cameras of a batch on the host. They have the size of the request, and belong to
@@ -78,9 +82,10 @@ constexpr float kMostShare = 2.0f;
 // cut. `rule` is the request's rule after changes by a pool or by the pacing of a
 // budget. Throws std::out_of_range if the request's cut has a pair that is not in the
 // scene. If `stop` becomes true, it returns soon, and the pictures are incomplete.
+// `sensors` has one per picture, or none.
 SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, Span<const Picture<float>> pictures,
-                            const std::atomic<bool>* stop = nullptr);
+                            Span<const Sensor> sensors, const std::atomic<bool>* stop = nullptr);
 
 // Draws a picture for each camera. The decisions and the pixels are equal to those of
 // draw_scene() for the instances that the camera sees. Each thread draws the pictures
@@ -89,10 +94,12 @@ SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
 void draw_batch(const HostScene& scene, const BatchRequest& request, const HostCameras& cameras,
                 Span<SceneFrameCounts> counts);
 
-// Draws all gaussians of one model, in world coordinates.
+// Draws all gaussians of one model, in world coordinates. For the ids of a sensor, the
+// model is instance 0.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count,
                             const Appearance<float>& appearance, const Camera& camera,
-                            const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
+                            const Picture<float>& picture, const Sensor& sensor,
+                            const std::atomic<bool>* stop = nullptr);
 
 // Finds the gaussian with the largest blend weight in the first pixel of the first
 // eye's window, in the cut of draw_scene(). Returns whether any gaussian is drawn

@@ -13,6 +13,7 @@
 #include "base/clock.h"
 #include "base/parallel_for.h"
 #include "draw/false_color.h"
+#include "draw/sense.h"
 #include "math/sh.h"
 
 namespace v3dg {
@@ -75,6 +76,10 @@ class CutDraws {
     }
 
     const std::vector<Draw<float>>& draws() const { return draws_; }
+    // Returns the id of each draw's instance.
+    Span<const int32_t> instances() const {
+        return {instance_of_draw_.data(), instance_of_draw_.size()};
+    }
     int64_t num_gaussians() const { return static_cast<int64_t>(num_gaussians_); }
     // Returns the index of the pair that a gaussian belongs to. `gaussian` is counted
     // over all draws.
@@ -119,8 +124,13 @@ class CutDraws {
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
-            draws_.push_back(next);
+            add_draw(next, i);
         last_instance_ = i;
+    }
+
+    void add_draw(const Draw<float>& draw, int32_t i) {
+        draws_.push_back(draw);
+        instance_of_draw_.push_back(scene_.instance_ids.empty() ? i : scene_.instance_ids[i]);
     }
 
     // Returns whether a and b, draws of one instance, can be joined: b begins where a
@@ -134,6 +144,7 @@ class CutDraws {
     const Camera& camera_;
     const bool fades_;
     std::vector<Draw<float>> draws_;
+    std::vector<int32_t> instance_of_draw_;
     // [S] end of each pair's gaussians, counted over all draws.
     std::vector<uint64_t> end_of_pair_;
     uint64_t num_gaussians_ = 0;
@@ -158,13 +169,16 @@ void set_tint(const Rgb& rgb, float* tint) {
 // `tolerance_px2` is the tolerance of the cut.
 SceneFrameCounts draw_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
                             float tolerance_px2, const float* tint, Picture<float> picture,
-                            Workspace<float>& workspace, const std::atomic<bool>* stop) {
+                            const Sensor& sensor, Workspace<float>& workspace,
+                            const std::atomic<bool>* stop) {
     const double start = now();
     picture.min_transmittance = stop_of_cut(picture.min_transmittance, tolerance_px2);
     const CutDraws cut(scene, camera, given, tint);
+    const DrawnSensor drawn{
+        .sensor = sensor, .instance_of_draw = cut.instances(), .label_of_instance = scene.labels};
     SceneFrameCounts counts{};
-    counts.render =
-        render<float>(cut.draws(), camera.intrinsics<float>(), picture, false, workspace, stop);
+    counts.render = render<float>(cut.draws(), camera.intrinsics<float>(), picture, false,
+                                  workspace, stop, sensor.is_on() ? &drawn : nullptr);
     counts.gaussians = cut.num_gaussians();
     counts.draw_seconds = now() - start;
     return counts;
@@ -235,9 +249,32 @@ void select_for(const HostScene& scene, const FrameRequest& request, const Selec
                 out);
 }
 
+// Sets the channel `clipped` of a picture of these pairs.
+void clip_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
+                const Window& window, uint8_t* clipped, const std::atomic<bool>* stop) {
+    mark_clipped(CutDraws(scene, camera, given).draws(), camera.pinhole(), window, clipped, stop);
+}
+
+// Sets the channel `clipped` of a picture whose cut has this tolerance. A cut leaves
+// out clusters before the near plane and beside the frustum, so the whole cut is
+// selected.
+void clip_selected(const HostScene& scene, const Camera& camera, SelectRule rule,
+                   float tolerance_px2, const Window& window, uint8_t* clipped,
+                   const std::atomic<bool>* stop) {
+    HostScene whole = scene;
+    whole.needs = {};
+    whole.last_bin = nullptr;
+    rule.tolerance_px2 = tolerance_px2;
+    rule.budget = kNoBudget;
+    rule.culls = false;
+    SelectOutput cut;
+    select_for(whole, {.eyes = camera, .rule = rule, .shade = {}}, rule, cut);
+    clip_pairs(whole, camera, pairs_of(cut), window, clipped, stop);
+}
+
 SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, const Picture<float>& picture,
-                            const std::atomic<bool>* stop) {
+                            const Sensor& sensor, const std::atomic<bool>* stop) {
     const Camera& camera = request.eyes.camera[0];
     const GivenCut& given = *request.cut;
     std::vector<float> tint;
@@ -246,14 +283,17 @@ SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
         static_cast<void>(CutDraws(scene, camera, given));
         tint = tint_of(scene, request, rule, given, rule.tolerance_px2);
     }
+    if (sensor.planes.clipped != nullptr)
+        clip_pairs(scene, camera, given, picture.window, sensor.planes.clipped, stop);
     const LentWorkspace workspace;
     return draw_pairs(scene, camera, given, rule.tolerance_px2,
-                      tint.empty() ? nullptr : tint.data(), picture, *workspace, stop);
+                      tint.empty() ? nullptr : tint.data(), picture, sensor, *workspace, stop);
 }
 
 SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& request,
                                const SelectRule& rule, Span<const Picture<float>> pictures,
-                               Workspace<float>& workspace, const std::atomic<bool>* stop) {
+                               Span<const Sensor> sensors, Workspace<float>& workspace,
+                               const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
     select_for(scene, request, rule, cut);
@@ -262,10 +302,16 @@ SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& reque
     std::vector<float> tint;
     if (cut.fits_budget) tint = tint_of(scene, request, rule, given, cut.tolerance_px2);
     SceneFrameCounts counts{};
-    for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
-        counts.add_picture(draw_pairs(scene, request.eyes.camera[k], given, cut.tolerance_px2,
-                                      tint.empty() ? nullptr : tint.data(), pictures[k], workspace,
-                                      stop));
+    for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k) {
+        const Sensor sensor = sensors.empty() ? Sensor{} : sensors[k];
+        const Camera& camera = request.eyes.camera[k];
+        counts.add_picture(draw_pairs(scene, camera, given, cut.tolerance_px2,
+                                      tint.empty() ? nullptr : tint.data(), pictures[k], sensor,
+                                      workspace, stop));
+        if (sensor.planes.clipped != nullptr)
+            clip_selected(scene, camera, rule, cut.tolerance_px2, pictures[k].window,
+                          sensor.planes.clipped, stop);
+    }
     counts.gaussians = cut.num_gaussians;
     counts.tolerance_px2 = cut.tolerance_px2;
     counts.exceeds_budget = !cut.fits_budget;
@@ -282,6 +328,7 @@ class SeenInstances {
         const int32_t count = environments.num_slots(environment);
         for (int32_t slot = 0; slot < count; ++slot) {
             const auto i = static_cast<size_t>(environments.instance_of(environment, slot));
+            ids_.push_back(static_cast<int32_t>(i));
             bundle_.push_back(all.bundle[i]);
             position_.insert(position_.end(), &all.position[3 * i], &all.position[3 * i] + 3);
             quaternion_.insert(quaternion_.end(), &all.quaternion[4 * i],
@@ -299,9 +346,11 @@ class SeenInstances {
                 .importance = {importance_.data(), importance_.size()},
                 .factors = {factors_.data(), factors_.size()}};
     }
+    // Returns the ids of the instances in the whole scene.
+    Span<const int32_t> ids() const { return {ids_.data(), ids_.size()}; }
 
   private:
-    std::vector<int32_t> bundle_;
+    std::vector<int32_t> ids_, bundle_;
     std::vector<double> position_, quaternion_, scale_;
     std::vector<float> importance_;
     std::vector<InstanceFactors> factors_;
@@ -329,23 +378,30 @@ SceneFrameCounts draw_picture(const HostScene& scene, const BatchRequest& reques
                               const HostCameras& cameras, size_t k, Workspace<float>& workspace) {
     const FrameRequest one{.eyes = cameras.camera[k], .rule = request.rule, .shade = request.shade};
     const Picture<float> picture = picture_of(request, k);
+    const size_t num_pixels = static_cast<size_t>(request.width) * request.height;
+    const Sensor sensor = request.sensor.from(k * num_pixels);
     const int32_t environment = cameras.environment[k];
     if (environment == kSeesAll)
-        return draw_selected(scene, one, request.rule, {&picture, 1}, workspace, nullptr);
+        return draw_selected(scene, one, request.rule, {&picture, 1}, {&sensor, 1}, workspace,
+                             nullptr);
     const SeenInstances seen(scene.instances, cameras.environments, environment);
     HostScene part = scene;
     part.instances = seen.table();
-    return draw_selected(part, one, request.rule, {&picture, 1}, workspace, nullptr);
+    part.instance_ids = seen.ids();
+    return draw_selected(part, one, request.rule, {&picture, 1}, {&sensor, 1}, workspace, nullptr);
 }
 
 }  // namespace
 
 SceneFrameCounts cpu::draw_scene(const HostScene& scene, const FrameRequest& request,
                                  const SelectRule& rule, Span<const Picture<float>> pictures,
-                                 const std::atomic<bool>* stop) {
-    if (request.cut) return draw_given(scene, request, rule, pictures[0], stop);
+                                 Span<const Sensor> sensors, const std::atomic<bool>* stop) {
+    if (request.cut) {
+        const Sensor sensor = sensors.empty() ? Sensor{} : sensors[0];
+        return draw_given(scene, request, rule, pictures[0], sensor, stop);
+    }
     const LentWorkspace workspace;
-    return draw_selected(scene, request, rule, pictures, *workspace, stop);
+    return draw_selected(scene, request, rule, pictures, sensors, *workspace, stop);
 }
 
 void cpu::draw_batch(const HostScene& scene, const BatchRequest& request,
@@ -367,14 +423,20 @@ void cpu::draw_batch(const HostScene& scene, const BatchRequest& request,
 
 SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count,
                                  const Appearance<float>& appearance, const Camera& camera,
-                                 const Picture<float>& picture, const std::atomic<bool>* stop) {
+                                 const Picture<float>& picture, const Sensor& sensor,
+                                 const std::atomic<bool>* stop) {
     const double start = now();
     const std::vector<Draw<float>> draws{
         {&model, 0, count, view_of_world<float>(camera), appearance}};
+    const int32_t only = 0;
+    const DrawnSensor drawn{
+        .sensor = sensor, .instance_of_draw = {&only, 1}, .label_of_instance = {}};
     const LentWorkspace workspace;
     SceneFrameCounts counts{};
-    counts.render =
-        render<float>(draws, camera.intrinsics<float>(), picture, false, *workspace, stop);
+    counts.render = render<float>(draws, camera.intrinsics<float>(), picture, false, *workspace,
+                                  stop, sensor.is_on() ? &drawn : nullptr);
+    if (sensor.planes.clipped != nullptr)
+        mark_clipped(draws, camera.pinhole(), picture.window, sensor.planes.clipped, stop);
     counts.gaussians = static_cast<int64_t>(count);
     counts.draw_seconds = now() - start;
     return counts;

@@ -84,8 +84,8 @@ V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const Entry
             ((3 - (y1 - y0)) << 8 | (7 - (x1 - x0)) << 5 | y0 << 3 | x0)};
 }
 
-// Return the upper 26 bits of a key, which are depth, and the next 28, which are depth
-// and record.
+// The first returns the upper 26 bits of the depth in a key. The second returns the 28
+// bits after these: the other bits of the depth, then the index of the record.
 V3DG_HD inline uint32_t key_depth(TileEntry e) {
     return static_cast<uint32_t>(e.key >> (kEntryBoxBits + kMostRecordBits));
 }

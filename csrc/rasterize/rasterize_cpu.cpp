@@ -16,21 +16,6 @@ static void blend_entries(const Record<T>* records, EntryFormat format, const ui
     });
 }
 
-// Calls visit(index in the tile, index in the picture) for each pixel of the tile that
-// is inside the window.
-template <class Visit>
-static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window,
-                                       const Visit& visit) {
-    for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
-        const int x0 = left + block % kTileBlocks * kBlockSize,
-                  y0 = top + block / kTileBlocks * kBlockSize;
-        for (int y = max_of(y0, window.y0); y < min_of(y0 + kBlockSize, window.y1); ++y)
-            for (int x = max_of(x0, window.x0); x < min_of(x0 + kBlockSize, window.x1); ++x)
-                visit(block * kBlockPixels + (y - y0) * kBlockSize + (x - x0),
-                      static_cast<size_t>(y - window.y0) * window.width() + (x - window.x0));
-    }
-}
-
 template <class T>
 void rasterize_tile(const Record<T>* records, EntryFormat format, const uint64_t* entry,
                     size_t count, int left, int top, const Picture<T>& picture) {

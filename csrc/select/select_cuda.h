@@ -35,7 +35,7 @@ struct NeedList {
     PageRequest* reported = nullptr;
 };
 
-// The bundles of a scene of which only some pages are resident.
+// What a cut reads and requests in a pool, where only some pages are resident.
 struct PartlyResident {
     const BundleOnDevice* bundles;
     NeedList needs;  // `report` is null if no report is requested

@@ -1,5 +1,5 @@
-"""A short part of each attack of fuzz/attack.py, which runs for as long as one
-likes."""
+"""Runs a short part of each attack in fuzz/attack.py. That program itself runs for any
+length of time."""
 
 import json
 
@@ -7,8 +7,8 @@ import pytest
 
 from fuzz.attacks.pool import attack
 
-# About a minute of two cores in all: tries of each kind, from seeds that the long runs
-# do not begin with.
+# All attacks together take about a minute on two cores. Their seeds differ from those
+# at which long runs begin.
 TRIES = {
     "files": 500,
     "commands": 24,

@@ -1,5 +1,6 @@
-"""Small files that claim or expand to much: what readers hold is bounded by what
-docs/robustness.md says.
+"""Small files that claim or expand to much. The memory of readers stays below the
+limits in docs/robustness.md. A separate process reads each file within a minute, and
+the system measures its peak memory.
 
 Each is read by a process of its own, whose largest memory the system measures, and
 which has a minute.
@@ -27,7 +28,7 @@ from v3dg import Gaussians, write_asset
 from v3dg.formats import sog
 
 FREE_GAUSSIANS = 1 << 18
-# docs/robustness.md
+# These are the limits in docs/robustness.md.
 BASE, PER_BYTE, PER_BYTE_OF_JSON, PER_GAUSSIAN = 100_000_000, 8, 40, 400
 
 CHILD = """
@@ -53,7 +54,7 @@ WARM_UP = [FIXTURES / name for name in ("sh3.ply", "sh3.sog", "sh3_v3.spz", "sh3
 
 
 def read_apart(path):
-    """Bytes that reading a file took, and what came of it."""
+    """Return the bytes of memory that reading a file took, and the outcome."""
     done = subprocess.run(
         [sys.executable, "-c", CHILD, path, *WARM_UP],
         capture_output=True,
@@ -66,7 +67,7 @@ def read_apart(path):
 
 
 def equal_gaussians(count, degree=0):
-    """All alike: as small as a file of so many can be."""
+    """Return equal gaussians, whose file is as small as a file of so many can be."""
     one = Gaussians(
         np.ones((1, 3), np.float32),
         np.array([[1, 0, 0, 0]], np.float32),
@@ -92,7 +93,8 @@ def picture(width, height, kind="WEBP", **options):
 
 
 def sog_files(made, degree=0, **changes):
-    """Of equal gaussians, whatever they claim."""
+    """Return the entries of a `.sog` file of equal gaussians that claims any number of
+    them."""
     files = sog.encode(equal_gaussians(made, degree))
     meta = json.loads(files["meta.json"])
     for key, value in changes.items():
@@ -114,7 +116,7 @@ JSON_BOMB = b'{"version":2,"count":1,"x":[' + b"[]," * (1 << 25) + b"[]]}"
 
 
 def lying_zip():
-    """A member that says it has 100 bytes and expands to 256 MB."""
+    """Return a zip file with a member that claims 100 bytes and expands to 256 MB."""
     content = bytearray(zipped({"meta.json": bytes(1 << 28)}))
     for place, offset in ((content.index(b"PK\3\4"), 22), (content.rindex(b"PK\1\2"), 24)):
         content[place + offset : place + offset + 4] = struct.pack("<I", 100)
@@ -122,7 +124,7 @@ def lying_zip():
 
 
 def canvas(width, height):
-    """A small picture in a file that says it is part of a large one."""
+    """Return a small picture in a file that claims to be a part of a large picture."""
     small = picture(4, 4, lossless=True)[12:]
     sides = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
     body = b"WEBPVP8X" + struct.pack("<IB3x", 10, 0x10) + sides + small
@@ -130,7 +132,7 @@ def canvas(width, height):
 
 
 def many_members():
-    """Entries of a zip's directory, of 47 bytes each."""
+    """Return the directory of a zip file with many entries of 47 bytes each."""
     entry = struct.pack("<4s4B4HL2L5H2L", b"PK\1\2", 20, 0, 20, 0, *[0] * 7, 1, *[0] * 6) + b"a"
     end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, 100_000 * len(entry), 4, 0)
     return b"PK\3\4" + 100_000 * entry + end
@@ -179,7 +181,7 @@ def spz_header(count, version=3, degree=0):
 
 
 def spz_of_zstd(count, num_bytes, degree=0):
-    """Streams of zeros, each of which may expand to more than it says."""
+    """Return streams of zeros that may expand to more than they claim."""
     sizes = [count * width for width in (9, 1, 3, 3, 4, 45)][: 6 if degree else 5]
     streams = [zstandard.ZstdCompressor().compress(bytes(num_bytes or size)) for size in sizes]
     table = b"".join(
@@ -242,8 +244,8 @@ def pickled(body):
 
 
 def tuple_bomb(end):
-    """A tuple of twice the last tuple, 60 times: 2^60 to whoever looks into all of
-    it."""
+    """Return a pickle of a tuple that contains the last tuple twice, 60 times over. A
+    reader that visits all items visits 2^60."""
     nested = b")q\x00" + b"".join(
         b"h" + bytes([i]) * 1 + b"h" + bytes([i]) + b"\x86q" + bytes([i + 1]) for i in range(60)
     )
@@ -283,7 +285,8 @@ CHECKPOINT = {
 
 
 def ksplat_of_one_high_degree():
-    """A section of degree 2 without gaussians gives all others zeros to hold."""
+    """Return a file in which one empty section of degree 2 makes all other sections
+    store zeros."""
     count = 40_000
     head = bytearray(4096)
     struct.pack_into("<BB2xI8xIH", head, 0, 0, 1, 2, count, 1)
@@ -311,7 +314,7 @@ PLY = {
 
 
 def glb_of(document, blob=b""):
-    """A file with its JSON and its binary chunk."""
+    """Return a `.glb` file with this JSON and this binary chunk."""
     text = document if isinstance(document, bytes) else json.dumps(document).encode()
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
     chunks += struct.pack("<II", len(blob), 0x004E4942) + blob
@@ -319,7 +322,8 @@ def glb_of(document, blob=b""):
 
 
 def glb_of_one_stream(times):
-    """As many primitives, all of the same large stream of one gaussian."""
+    """Return a file with many primitives that share one large stream of a single
+    gaussian."""
     stream = gzip.compress(spz_header(1) + bytes(20)) + bytes(1 << 20)
     extension = {"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}
     primitive = {"attributes": {"POSITION": 0}, "extensions": {"KHR_gaussian_splatting": extension}}
@@ -333,7 +337,7 @@ def glb_of_one_stream(times):
 
 
 def glb_of_zeros(nodes, count, times=1, **fields):
-    """As many gaussians without a single number of their own."""
+    """Return a file of many gaussians whose accessors store no numbers."""
     names = ("SCALE", "ROTATION", "OPACITY", "SH_DEGREE_0_COEF_0")
     attributes = {f"KHR_gaussian_splatting:{name}": i for i, name in enumerate(names, 1)}
     primitive = {
@@ -391,7 +395,7 @@ READ = ["splat: zeros", "ksplat: a high degree without gaussians", "spz: many st
 
 def assert_bounded(path, num_bytes):
     peak, found = read_apart(path)
-    # What docs/robustness.md has figures of.
+    # docs/robustness.md has figures for these files.
     print(f"{num_bytes:,} bytes, {peak >> 20} MiB, {found}")
     believed = FREE_GAUSSIANS + num_bytes
     count = int(found.split()[1]) if found.startswith("read") else 0
@@ -415,7 +419,8 @@ def test_a_bomb_is_refused_or_cheap(tmp_path, case):
 
 
 def streamed(folder, names, leaves=None, tree=None, **others):
-    """A lod-meta.json; each leaf has a file's number, an offset and a count."""
+    """Return a lod-meta.json. Each leaf consists of the number of a file, an offset and
+    a count."""
     runs = [dict(zip(("file", "offset", "count"), leaf, strict=True)) for leaf in leaves or []]
     tree = tree or {"children": [{"lods": {"0": run}} for run in runs]}
     path = folder / "lod-meta.json"
@@ -424,7 +429,8 @@ def streamed(folder, names, leaves=None, tree=None, **others):
 
 
 def deep_and_wide(folder):
-    """Nodes whose places, written out, would take ten gigabytes."""
+    """Return a tree of nodes whose places would fill ten gigabytes if they were written
+    out."""
     tree = '{"children":[' * 400 + ",".join(["{}"] * 1_000_000) + "]}" * 400
     path = folder / "lod-meta.json"
     path.write_text('{"filenames":[],"tree":' + tree + "}")
@@ -432,7 +438,8 @@ def deep_and_wide(folder):
 
 
 def one_file(folder, make_name, times):
-    """Many names of one file of 60,000 gaussians, each of which all are taken of."""
+    """Return an asset whose tree takes all gaussians of one file of 60,000 under many
+    names."""
     names = [make_name(i) for i in range(times)]
     for name in names[1:]:
         if not (folder / name).exists():
@@ -477,15 +484,15 @@ def test_a_name_that_is_there_many_times_is_read_once(tmp_path):
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.compressed.ply", "a.ply"])
 def test_equal_gaussians_read_back_however_many(tmp_path, name, degree):
-    """A constant picture has 74 bytes whatever its size; beyond a number the writer
-    adds what is missing."""
+    """A constant picture has 74 bytes whatever its size. If that is too few for the
+    number of gaussians, the writer adds padding."""
     write_asset(tmp_path / name, equal_gaussians(FREE_GAUSSIANS + 50_000, degree))
     assert assert_bounded(tmp_path / name, (tmp_path / name).stat().st_size) == "read 312144"
 
 
 @pytest.mark.parametrize("part", ["means", "quats", "scales", "opacities", "sh"])
 def test_one_constant_picture_is_read(tmp_path, part):
-    """As point clouds have, and captures made by others."""
+    """Point clouds and captures of other programs have such pictures."""
     rng = np.random.default_rng(0)
     asset = equal_gaussians(70_000, 1)
     for other in {"means", "quats", "scales", "opacities", "sh"} - {part}:
@@ -496,7 +503,8 @@ def test_one_constant_picture_is_read(tmp_path, part):
 
 
 def test_pictures_of_the_size_that_other_writers_round_to_are_read(tmp_path):
-    """A square of a power of two has up to four times the pixels."""
+    """A square picture with a power of two as side has up to four times as many pixels
+    as gaussians."""
     files = {
         name: picture(1024, 1024, lossless=True) for name in sog_files(9) if name != "meta.json"
     }

@@ -1,4 +1,4 @@
-"""Replays what fuzzers that are guided by coverage found and kept."""
+"""Replays the inputs that coverage-guided fuzzers found and kept."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ def test_kept_inputs_are_read_or_refused(tmp_path, name):
 
 
 def has_fuzzer(folder):
-    """Whether there is a clang++ that comes with its fuzzer."""
+    """Return whether there is a clang++ with libFuzzer."""
     compiler = shutil.which(os.environ.get("CLANG", "clang++"))
     if compiler is None:
         return False

@@ -1,5 +1,6 @@
-"""Every value in the JSON of every file that is read, replaced by values of other
-kinds.
+"""Every value in the JSON of every kind of file is replaced by values of other types.
+Each changed file is read, or its reader refuses it with a ValueError of one line that
+begins with the file's name.
 
 Each file is then read, or refused with the ValueError of its reader, in one line that
 begins with the file.
@@ -20,7 +21,7 @@ from gltf_files import file_of_every_part
 from random_bundle import random_gaussians
 from v3dg._json import is_one_line
 
-LONG = "a number of 5,000 digits"  # which stands for one
+LONG = "a number of 5,000 digits"  # stands for an exchanged value
 ODD = [[], [26], [[]], [None], {}, {"a": 1}, None, True, False, "", "a", "0", "\x1b[31m", LONG]
 ODD += [
     0,
@@ -43,11 +44,11 @@ ERRORS = (ValueError, FileNotFoundError)
 
 
 def places(value):
-    """Every value in a document, as what holds it and its key."""
+    """Yield every value in a document, as its container and its key."""
     if isinstance(value, dict):
         keys = list(value)
     elif isinstance(value, list):
-        # Numbers of a long table are alike.
+        # The numbers of a long table are alike, so only some are exchanged.
         keys = list(range(len(value))) if len(value) < 20 else [0, 1, len(value) - 1]
     else:
         keys = []
@@ -57,7 +58,8 @@ def places(value):
 
 
 def variants(document):
-    """Documents with one value exchanged or left out, and what was done."""
+    """Yield documents in which one value is exchanged or missing, with a description of
+    the change."""
     yield from ((odd, f"top level: {odd!r:.60}") for odd in ODD)
     document = copy.deepcopy(document)
     for holder, key in list(places(document)):
@@ -75,7 +77,8 @@ def variants(document):
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A file: its document, how it is written with another one, and read."""
+    """A kind of file: its document, how a changed document is written, and how the file
+    is read."""
 
     document: object
     write: object
@@ -139,7 +142,7 @@ def read_cameras(path):
 
 
 def read_both(path):
-    """What is looked at first, and the gaussians."""
+    """Read the parts of a file that commands look at first, and then the gaussians."""
     from v3dg.io import open_asset
 
     notes = open_asset(path).declared.notes
@@ -178,7 +181,7 @@ def kind(request, tmp_path):
     return json_kind(tmp_path, good, read)
 
 
-@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")  # read_both looks at notes
+@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")  # read_both reads notes
 def test_every_value_of_another_kind_is_named(kind):
     faults = []
     for document, change in variants(kind.document):

@@ -1,4 +1,9 @@
-"""Exports in SuperSplat's own viewer, and in their own page, in Chromium.
+"""Exports are opened in SuperSplat's own viewer and in their own pages, in Chromium.
+The tests need playwright, Chromium on PATH, and environment variables:
+SUPERSPLAT_VIEWER is the folder `public` of `npm install
+@playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file `build/playcanvas.min.mjs` of
+`npm install playcanvas@2.23.3`, and CESIUM the folder `Build/Cesium` of `npm install
+cesium@1.145.0`.
 
 They need playwright, Chromium where PATH finds it, and what environment variables name:
 SUPERSPLAT_VIEWER the folder `public` of `npm install
@@ -39,7 +44,7 @@ SIDE = 300
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves files, and remembers which."""
+    """Serves files and records the names of the files that were requested."""
 
     def log_message(self, *_):
         self.server.asked.append(self.path)
@@ -76,8 +81,8 @@ needs_engine = pytest.mark.skipif(
 
 
 def seen(browser, server, options=""):
-    """The picture that the viewer settles at, (H, W, 3), and the levels whose files it
-    asked for."""
+    """Return the picture (H, W, 3) of the viewer once it no longer changes, and the
+    levels whose files it requested."""
     errors = []
     server.asked.clear()
     page = browser.new_page(viewport={"width": SIDE, "height": SIDE})
@@ -110,12 +115,12 @@ def seen(browser, server, options=""):
 
 
 def wanted(bundle, server):
-    """Our picture from where the viewer looks, with the filter that it has."""
+    """Return our picture from the viewer's camera, with the viewer's filter."""
     pose = json.loads((server.folder / "donut" / "settings.json").read_text())["cameras"][0][
         "initial"
     ]
-    # The viewer has y up, and shows -y of an asset as up; the asset was turned so that
-    # z is.
+    # The viewer's y axis points up, and it shows -y of an asset as up. The asset was
+    # turned so that z is up.
     back = np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]])
     eye, target = (back @ np.array(pose[name]) for name in ("position", "target"))
     fov = np.radians(pose["fov"])
@@ -139,7 +144,7 @@ def test_a_budget_brings_coarser_levels_that_look_alike(browser, server, bundle)
 
 @pytest.fixture(scope="module")
 def town(bundle):
-    """Ninety instances, from near to far, and a camera."""
+    """Return ninety instances from near to far, and a camera."""
     rng = np.random.default_rng(0)
     scene = v3dg.Scene()
     positions = np.stack([rng.uniform(-4, 4, 90), rng.uniform(0, 40, 90), np.zeros(90)], axis=1)
@@ -148,8 +153,8 @@ def town(bundle):
 
 
 def page_of(browser, server, town, query):
-    """The picture at which the page of a town settles, and how many gaussians it
-    draws."""
+    """Return the picture of a town's page once it no longer changes, and the number of
+    gaussians in it."""
     scene, camera = town
     folder = server.folder / "town"
     if not folder.exists():
@@ -159,7 +164,8 @@ def page_of(browser, server, town, query):
 
 
 def settled(browser, server, address):
-    """The picture at which one of our pages settles, and how much it draws."""
+    """Return the picture of one of our pages once it no longer changes, and the number
+    of gaussians in it."""
     page = browser.new_page(viewport={"width": SIDE, "height": SIDE})
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
@@ -193,17 +199,17 @@ def test_the_page_of_a_scene_keeps_its_budget(browser, server, town, budget):
     assert 0.9 * budget < drawn <= budget
 
 
-# Widths and heights in CSS px, by which the page chooses levels, and device pixels for
-# each: few on the desktop, because software draws them.
+# Widths and heights in CSS px, by which the page chooses levels, and device pixels per
+# CSS px. The desktop has few, because software draws them.
 SIZES = {"desktop": (1920, 1080, 0.1), "phone": (390, 844, 3)}
 BUDGET = 20_000
 
 
 @pytest.fixture(scope="module")
 def crowd(server, bundle):
-    """The folder of a page with 225 instances, in chunks of which the coarsest levels
-    of the bundle would leave most empty, and cameras inside of the crowd and around
-    it."""
+    """Return the folder of a page with 225 instances, and cameras inside and around the
+    crowd. The chunks are so small that the bundle's coarsest levels would leave most of
+    them empty."""
     rng = np.random.default_rng(1)
     row = np.arange(15) * 1.5 - 10.5
     positions = np.stack([*np.meshgrid(row, row), np.zeros((15, 15))], axis=-1).reshape(-1, 3)
@@ -225,7 +231,7 @@ def crowd(server, bundle):
 
 
 class WatchedPage:
-    """One of our pages, and the number of gaussians that each of its frames draws."""
+    """One of our pages, with the number of gaussians that each of its frames drew."""
 
     RECORD = """
         window.frames_drawn = [];
@@ -247,12 +253,13 @@ class WatchedPage:
         self.page.goto(f"http://127.0.0.1:{server.server_address[1]}/{address}")
 
     def settled(self):
-        """How many gaussians are drawn once all that the view needs is."""
+        """Return the number of gaussians that are drawn once everything is loaded that
+        the view needs."""
         self.page.wait_for_function("window.v3dg?.ready", timeout=120_000)
         return self.page.evaluate("window.v3dg.drawn")
 
     def drawn(self):
-        """How many each frame drew since the last call."""
+        """Return the numbers of gaussians that the frames since the last call drew."""
         return self.page.evaluate("window.frames_drawn.splice(0)")
 
     def go_to(self, camera):
@@ -294,7 +301,7 @@ def watched(browser, server, crowd, request):
 @needs_engine
 @pytest.mark.parametrize("watched", SIZES, indirect=True)
 def test_the_budget_holds_inside_a_crowd_and_after_jumps(watched):
-    """In every frame: while levels load, too."""
+    """The budget holds in every frame, also while levels are loaded."""
     assert 0.8 * BUDGET < watched.settled() <= BUDGET
     for camera in (1, 0, 3, 2):
         watched.go_to(camera)
@@ -312,7 +319,7 @@ def test_the_budget_holds_in_movement(watched):
         watched.page.keyboard.up(key)
     assert 0.8 * BUDGET < watched.settled() <= BUDGET
     drawn = watched.drawn()
-    assert len(set(drawn)) > 5  # the eye did move
+    assert len(set(drawn)) > 5  # the camera did move
     assert max(drawn) <= BUDGET
 
 
@@ -327,7 +334,8 @@ def test_a_budget_that_changes_holds(watched):
 
 @pytest.mark.skipif(CESIUM is None, reason="CESIUM does not name its folder")
 def test_cesium_shows_tiles_and_fewer_from_far(browser, server, bundle):
-    """From near those of the asset itself, one for each group of level 1."""
+    """From near, it shows the tiles of the asset itself, one for each group of level
+    1."""
     write_tiles(bundle, server.folder / "tiles", up="z")
     (server.folder / "tiles" / "cesium").symlink_to(CESIUM)
     picture, near = settled(browser, server, "tiles/index.html?distance=1.2")

@@ -1,4 +1,9 @@
-"""Files that we write, in the engines of others, in Chromium: each draws what we draw.
+"""The files that we write look in the engines of other projects as we draw them, in
+Chromium. The tests need playwright, Chromium on PATH, and the environment variable
+NODE_MODULES. This is the folder that `npm install playcanvas@2.23.3 three@0.187.0
+@sparkjsdev/spark@2.2.0 babylonjs@9.28.0 babylonjs-loaders@9.28.0 @adobe/spz@0.2.2
+fflate@0.8.3` creates. If SCREENSHOTS names a folder, the pictures of the engines and
+ours are saved there.
 
 They need playwright, Chromium where PATH finds it, and the environment variable
 NODE_MODULES, which names the folder that `npm install playcanvas@2.23.3 three@0.187.0
@@ -38,13 +43,13 @@ pytestmark = [
 ]
 
 SIDE, FOV = 300, 40
-EYE = (0.18, -0.38, 0.30)  # of the donut, whose z is up
+EYE = (0.18, -0.38, 0.30)  # axis of the donut that points up
 UP = (0.0, 0.0, 1.0)
-# The axes of files that are turned, from those of a donut whose z is up.
+# The axes of files whose asset is turned; z is up in the donut.
 AXES = {".spz": _axes.OPENGL, ".glb": _axes.GLTF}
 
-# Each page looks from EYE at the origin, with UP up, and counts the pictures since its
-# asset was there.
+# Each page looks from EYE at the origin with UP up, and counts its pictures since the
+# asset was loaded.
 HEAD = """<!doctype html>
 <style>
 body { margin: 0; overflow: hidden }
@@ -104,7 +109,8 @@ scene.add(mesh);
 await mesh.initialized;
 renderer.setAnimationLoop(() => { renderer.render(scene, camera); window.frames_shown++; });
 </script>""",
-    # Babylon's world is left-handed: it reflects y of what it loads, and so is the eye.
+    # Babylon's coordinates are left-handed. It reflects y of the assets that it loads,
+    # so y of the eye is reflected, too.
     "babylon": """<script src="modules/babylonjs/babylon.js"></script>
 <script src="modules/babylonjs-loaders/babylonjs.loaders.min.js"></script>
 <script type="module">
@@ -136,7 +142,7 @@ engine.runRenderLoop(() => { scene.render(); window.frames_shown++; });
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves files without a word."""
+    """Serves files and logs nothing."""
 
     def log_message(self, *_):
         pass
@@ -149,7 +155,7 @@ def asset():
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory, asset):
-    """The address of a folder with files of an asset, and the folder."""
+    """Return the address of a folder with files of an asset, and the folder."""
     folder = tmp_path_factory.mktemp("files")
     for suffix in ("ply", "compressed.ply", "spz", "sog", "glb"):
         v3dg.write_asset(folder / f"donut.{suffix}", asset, up="z")
@@ -164,7 +170,7 @@ def site(tmp_path_factory, asset):
 
 
 def shown(browser, site, engine, file):
-    """The picture, (H, W, 3), at which the page of an engine settles."""
+    """Return the picture (H, W, 3) of an engine's page once it no longer changes."""
     address, folder = site
     page_file = folder / f"{engine}.html"
     turn = np.eye(3)
@@ -211,7 +217,7 @@ def test_an_engine_draws_what_we_do(browser, site, asset, engine, file):
     camera = v3dg.Camera.look_at(
         EYE, (0, 0, 0), (0, 0, 1), fov_x=np.radians(FOV), width=SIDE, height=SIDE
     )
-    if file.endswith(".json"):  # Babylon streams without what depends on the direction.
+    if file.endswith(".json"):  # Babylon does not load the harmonics of streamed assets
         asset = dataclasses.replace(asset, sh=np.ascontiguousarray(asset.sh[:, :1]))
     ours = np.clip(v3dg.rasterize(asset, camera, filter_px2=0.3).color, 0, 1)
     if SCREENSHOTS:

@@ -1,5 +1,5 @@
-"""The viewer in Chromium, as a person uses it. Needs playwright, and Chromium where
-PATH finds it."""
+"""The viewer is used in Chromium as a person uses it. The tests need playwright, and
+Chromium on PATH."""
 
 import base64
 import io
@@ -58,7 +58,7 @@ def site(tmp_path_factory):
 
 
 class Tab:
-    """A tab and what can be seen and done there."""
+    """A tab of the browser: what can be seen in it, and actions of a user."""
 
     def __init__(self, browser, url, size=(900, 600), **options):
         self.errors = []
@@ -81,14 +81,15 @@ class Tab:
         return float(cell.inner_text().split()[0].replace(",", ""))
 
     def settled(self):
-        """The picture, 8 bit, once it is drawn in full and the page says so."""
-        self.page.wait_for_timeout(300)  # until what was done before is on its way
+        """Return the picture as 8-bit values once it is drawn in full and the page says
+        so."""
+        self.page.wait_for_timeout(300)  # waits until earlier actions were sent
         self.page.wait_for_selector("body[data-state=ready]", timeout=1000 * SECONDS)
-        self.page.wait_for_timeout(300)  # until the browser has drawn it
+        self.page.wait_for_timeout(300)  # waits until the browser has drawn it
         return self.seen()
 
     def seen(self):
-        """The middle of the picture, where nothing lies over it."""
+        """Return the middle of the picture, which no control covers."""
         box = self.page.locator("#stage").bounding_box()
         clip = box | {"y": 90, "height": box["height"] - 220}
         return np.asarray(
@@ -96,8 +97,8 @@ class Tab:
         ).astype(int)
 
     def view(self):
-        """What the address says of the camera and the settings."""
-        self.page.wait_for_timeout(300)  # until what was done before has begun
+        """Return the camera and the settings in the page's address."""
+        self.page.wait_for_timeout(300)  # waits until earlier actions have begun
         self.page.wait_for_function("() => !viewer.requests.isMoving && !viewer.frames.isDue")
         hash = self.page.evaluate("location.hash").removeprefix("#")
         return dict(part.split("=", 1) for part in hash.split("&"))
@@ -115,7 +116,7 @@ class Tab:
         self.page.locator("#panel summary", has_text=folder).click()
 
     def set(self, slider, value):
-        """Give a slider its own value, as its keys do."""
+        """Set the value of a slider, as its keys do."""
         self.page.get_by_role("slider", name=slider, exact=True).evaluate(
             "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", value
         )
@@ -151,7 +152,8 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
     selected = tab.figure("selected")
     tab.set("Tolerance px²", 32)
     coarse = tab.settled()
-    assert tab.figure("selected") < 0.9 * selected  # from near, most is fine detail
+    # Near the asset, most of the picture is fine detail.
+    assert tab.figure("selected") < 0.9 * selected
     assert differ(turned, coarse) > 0.001
 
 
@@ -182,7 +184,7 @@ def test_page_asks_what_is_up_where_that_is_assumed(browser, site):
             group.get_by_role("button").click()
             tab.page.wait_for_selector(question, state="hidden")
             link = tab.page.url
-        with Tab(browser, link) as tab:  # which says what is up
+        with Tab(browser, link) as tab:  # declares which way is up
             tab.settled()
             assert tab.page.locator(question).count() == 0
     finally:
@@ -193,8 +195,8 @@ def test_page_asks_what_is_up_where_that_is_assumed(browser, site):
 
 
 def test_drag_is_answered_while_the_mouse_is_still_down(tab):
-    """First by the picture that is there, moved; then by drafts, which say what they
-    are."""
+    """First the existing picture is moved, and then drafts follow, which are marked as
+    such."""
     first = tab.settled()
     tab.page.mouse.move(200, 400)
     tab.page.mouse.down()
@@ -212,14 +214,16 @@ def test_drag_is_answered_while_the_mouse_is_still_down(tab):
 
 
 def test_moved_picture_is_nearly_the_one_that_follows(browser, site):
-    """From the same place, turned: where both have something, they show the same."""
+    """Both show the asset from the same place, turned. They are compared where both
+    have content."""
     with Tab(browser, site.url) as tab:
         tab.settled()
         tab.page.get_by_role("radio", name="Fly").click()
         first = tab.settled()
-        tab.page.evaluate("viewer.connection.send = () => {}")  # so that no picture follows
+        tab.page.evaluate("viewer.connection.send = () => {}")  # so that no further picture arrives
         tab.drag((200, 300), (260, 300))
-        # Where frames take the browser long, it follows so often only.
+        # Where the browser takes long for a frame, the picture follows the camera less
+        # often.
         tab.page.wait_for_timeout(300)
         moved = tab.seen()
         assert differ(first, moved) > 0.02
@@ -282,7 +286,8 @@ def test_budget_is_kept(tab):
 
 
 def test_keys_fly_at_a_pace_that_suits_the_scene(browser, site):
-    """As many of the scene's radii in a second, whether it is a donut or a world."""
+    """Keys move the camera by as many radii of the scene per second in a donut as in a
+    world."""
     shares = []
     for scale in (1e-3, 1.0, 1e4):
         scene = v3dg.Scene()
@@ -342,7 +347,7 @@ def test_walking_keeps_its_height_and_flying_does_not(tab):
     walked = after_w("Walk")
     assert np.linalg.norm(walked[:2]) > 0.1
     assert abs(walked[2]) < 1e-5
-    assert after_w("Fly")[2] < -0.05  # looking down from above
+    assert after_w("Fly")[2] < -0.05  # the camera looks down from above
 
 
 def test_gamepad_moves_and_turns(browser, site):
@@ -434,7 +439,7 @@ def test_a_link_that_asks_for_what_is_not_there_is_told_so(browser, site):
         assert "mode residency is not there" in tab.page.inner_text("#notices")
         view = tab.view()
         assert "show" not in view
-        assert float(view["split"]) == 0.5  # without a pool there is a split
+        assert float(view["split"]) == 0.5  # only a pool splits the memory
 
 
 def test_bookmarks_outlive_the_page_and_lead_back(tab):
@@ -482,7 +487,7 @@ def test_clicked_instance_is_selected_moved_undone_and_saved(browser, site):
         ) as tab:
             before = tab.settled()
             layer = tab.page.locator("#overlay")
-            # Nothing to blend over the picture.
+            # There is nothing to blend over the picture.
             assert layer.evaluate("e => e.style.opacity") == "0"
             at = tab.page.evaluate("viewer.overlay.projection.place([4, 0, 0])")
             tab.page.mouse.click(*at)
@@ -546,10 +551,11 @@ def test_dropped_file_is_shown(tab, tmp_path):
         content,
     )
     tab.page.wait_for_selector("#panel h1:text-is('few')", timeout=1000 * SECONDS)
-    tab.page.wait_for_timeout(900)  # until the camera is there
+    tab.page.wait_for_timeout(900)  # waits until the camera has arrived
     assert tab.settled().max() > 60
     assert tab.figure("selected") == 300
-    assert tab.figure("in the frustum") >= 0.96 * 300  # the share that a first view frames
+    # A first view fills this share of the window.
+    assert tab.figure("in the frustum") >= 0.96 * 300
 
 
 def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_path):
@@ -590,12 +596,12 @@ def test_phone_has_the_picture_to_itself(browser, site):
         assert tab.page.locator("#stage").bounding_box()["width"] == 390
         assert not tab.page.locator("#panel").is_visible()
         assert (picture.max(axis=2) > 30).mean() > 0.03
-        # The first view is the one for a narrow window, which the subject's width fits.
+        # The window is narrow, so the first view fits the width of the subject into it.
         homes = "viewer.scene.homes.map((home) => home.view.aspect)"
         aspects = tab.page.evaluate(homes)
         assert min(aspects) <= tab.page.evaluate("viewer.look.aspect") < max(aspects)
         edges = np.concatenate([picture[:, :4].reshape(-1, 3), picture[:, -4:].reshape(-1, 3)])
-        assert (edges.max(axis=1) > 60).mean() < 0.05  # stray gaussians reach the edges
+        assert (edges.max(axis=1) > 60).mean() < 0.05  # stray gaussians reach the borders
         tab.page.touchscreen.tap(195, 300)
         tab.page.get_by_role("button", name="Panel").tap()
         assert tab.page.locator("#panel").bounding_box()["y"] > 380
@@ -745,7 +751,8 @@ def test_a_box_is_drawn_dragged_and_saved_as_a_new_asset(browser, site, tmp_path
     alone = Site(SceneView(bundle, device="cpu"), name="blob", port=0, edits_folder=tmp_path)
     try:
         with Tab(browser, alone.url) as tab:
-            # The first view frames nearly all gaussians; the box of all is larger.
+            # The first view frames nearly all gaussians; the box of all gaussians is
+            # larger.
             tab.settled()
             tab.page.mouse.move(300, 300)
             for _ in range(5):
@@ -756,7 +763,8 @@ def test_a_box_is_drawn_dragged_and_saved_as_a_new_asset(browser, site, tmp_path
             tab.press("Draw a box")
             tab.page.wait_for_function("() => viewer.crop.isOn")
             assert differ(before, tab.settled()) > 0.002
-            # The face on the left, because the panel covers the picture on the right.
+            # This face is on the left, because the panel covers the picture on the
+            # right.
             face = "viewer.crop.inWorld(viewer.crop.middleOf({ axis: 0, end: 0 }))"
             place = f"viewer.overlay.projection.place({face})"
             handle = tab.page.evaluate(place)
@@ -765,7 +773,7 @@ def test_a_box_is_drawn_dragged_and_saved_as_a_new_asset(browser, site, tmp_path
             end = tab.page.evaluate(f"viewer.overlay.projection.place({target})")
             tab.drag(handle, end)
             dragged = tab.page.evaluate("viewer.crop.box")
-            # The face is where the pointer let go of it, and no other has moved.
+            # The face is where the pointer released it, and no other face has moved.
             np.testing.assert_allclose(dragged[0][0], target[0], atol=0.02 * (high[0] - low[0]))
             assert dragged[1] == high
             assert dragged[0][1:] == low[1:]

@@ -1,5 +1,7 @@
-"""What a page of another site learns of the viewer, in Chromium: nothing, not even the
-size of a picture.
+"""A page of another site learns nothing about the viewer in Chromium, not even the size
+of a picture. The tests need playwright, and Chromium on PATH. The other page has
+another port, and either the viewer's host name, which the browser treats as the same
+site, or another name, which is a cross site.
 
 Needs playwright, and Chromium where PATH finds it. The other page is at another port,
 under the viewer's name (the browser calls that the same site) and under another one (a
@@ -30,7 +32,7 @@ pytestmark = [
 ]
 
 SECONDS = 60
-# Each probe says what it learned: "nothing" where the browser reports but a failure.
+# Each probe reports what it learned: "nothing" if the browser reports only a failure.
 PROBES = """async (viewer) => {
   const element = (tag, fields) => new Promise((resolve) => {
     const node = document.createElement(tag);
@@ -106,7 +108,7 @@ def site(tmp_path_factory):
 
 
 class Blank(http.server.BaseHTTPRequestHandler):
-    """A page of another site, whose scripts the tests bring."""
+    """A page of another site. The tests provide its scripts."""
 
     def do_GET(self):
         body = b"<!doctype html><title>other</title><body>"
@@ -132,7 +134,7 @@ def other_port():
 
 @pytest.fixture(params=["127.0.0.1", "localhost"])
 def other(browser, other_port, request):
-    """A page of the same site, and of another one; the viewer is opened as
+    """Yield a page of the same site, and one of another site; the viewer is opened as
     127.0.0.1."""
     page = browser.new_page()
     page.goto(f"http://{request.param}:{other_port}/")
@@ -153,7 +155,7 @@ def test_another_page_learns_nothing_by_another_name_of_this_machine(other, site
 
 
 def test_the_viewers_own_page_has_all_of_it(browser, site):
-    """So that the probes above are known to work."""
+    """This shows that the probes above work."""
     page = browser.new_page()
     page.goto(site.url)
     learned = page.evaluate(PROBES, f"{site.url}/")

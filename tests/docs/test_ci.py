@@ -1,4 +1,4 @@
-"""The steps of .ci/run, the jobs that name them, and the summary of durations."""
+"""The steps of .ci/run, the jobs that use them, and the summary of durations."""
 
 import re
 import subprocess
@@ -70,7 +70,53 @@ def test_durations_are_summed_up(tmp_path):
     ]
 
 
-def test_the_citation_has_the_version():
-    version = re.search(r'"(.*)"', (ROOT / "v3dg" / "_version.py").read_text(encoding="utf-8"))[1]
+def version():
+    text = (ROOT / "v3dg" / "_version.py").read_text(encoding="utf-8")
+    return re.search(r'"(.*)"', text)[1]
+
+
+def test_the_citation_and_the_recipe_have_the_version():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert f"\nversion: {version}\n" in citation
+    assert f"\nversion: {version()}\n" in citation
+    recipe = (ROOT / "recipe" / "recipe.yaml").read_text(encoding="utf-8")
+    assert f'\n  version: "{version()}"\n' in recipe
+
+
+def test_the_recipe_asks_for_what_the_package_does():
+    settings = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    listed = re.search(r"^dependencies = \[\n(.*?)^\]", settings, re.MULTILINE | re.DOTALL)[1]
+    wanted = sorted(re.findall(r'^    "(.*?)"', listed, re.MULTILINE))
+    recipe = (ROOT / "recipe" / "recipe.yaml").read_text(encoding="utf-8")
+    run = re.search(r"^  run:\n    - python\n((?:    - .*\n)+)", recipe, re.MULTILINE)[1]
+    assert sorted(re.findall(r"- (.*)", run.replace(" >=", ">="))) == wanted
+
+
+def ci(program, *arguments):
+    return subprocess.run(
+        ["bash", CI / program, *arguments], capture_output=True, text=True, check=False
+    )
+
+
+def test_the_page_of_a_release_is_its_part_of_the_changelog():
+    printed = ci("notes", version()).stdout
+    assert printed in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert printed.strip()
+    assert "## [" not in printed
+
+
+def test_a_version_without_notes_is_refused():
+    done = ci("notes", "9.9.9")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "CHANGELOG.md: expected a part for [9.9.9] that says something\n"
+
+
+def test_wheels_are_not_begun_for_what_is_no_python():
+    done = ci("wheels", "/bin/false")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "/bin/false: expected a Python interpreter with venv\n"
+
+
+def test_wheels_are_tried_by_the_command_of_cibuildwheel():
+    """`.ci/wheels` finds the line with sed, so it has to keep its form."""
+    settings = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert re.search(r'^test-command = "v3dg demo [^"]*"$', settings, re.MULTILINE)

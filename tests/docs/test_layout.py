@@ -1,5 +1,4 @@
-"""The source tree keeps its layout: what is missing or forgotten in it is named
-here."""
+"""The source tree keeps its layout. Failures name what is missing or not listed."""
 
 import ast
 import os
@@ -15,8 +14,8 @@ from v3dg._extras import EXTRAS
 
 ROOT = Path(__file__).parents[2]
 CSRC = ROOT / "csrc"
-# What each folder of csrc/ may include beside itself. A folder includes only what
-# stands before it here.
+# The folders that each folder of csrc/ may include besides itself. A folder includes
+# only folders that are listed before it.
 MAY_INCLUDE = {
     "base": set(),
     "math": {"base"},
@@ -32,6 +31,7 @@ MAY_INCLUDE = {
     "project": {"base", "math", "camera", "frame", "quantize"},
     "tile_bin": {"base", "math", "frame"},
     "rasterize": {"base", "math", "frame"},
+    "rays": {"base", "math", "frame", "quantize", "project"},
     "fit_group": {"base", "math", "camera", "frame", "project", "tile_bin", "rasterize"},
     "draw": {
         "base",
@@ -44,6 +44,7 @@ MAY_INCLUDE = {
         "project",
         "tile_bin",
         "rasterize",
+        "rays",
     },
     "levels": {
         "base",
@@ -83,13 +84,14 @@ NOT_OPERATIONS = {
     "io",
     "frame",
     "residency",
+    "rays",
     "draw",
     "levels",
     "bindings",
 }
 TESTED_WITH = {"tile_bin": "rasterize"}
 KINDS = {"unit", "files", "system", "browser", "attack", "docs"}
-# Operations whose halves still have a contract each.
+# Operations whose CPU and CUDA parts still have one contract each.
 TWO_CONTRACTS = {"project", "select"}
 MOST_LINES_WITHOUT_A_HEAD = 100
 MOST_COLUMNS_OF_A_COMMENT = 88
@@ -104,7 +106,8 @@ MEASURING = sorted(
 
 
 def module_name(path):
-    """As it is imported; a package by its folder's name."""
+    """Return the name by which a module is imported; for a package, the name of its
+    folder."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -147,7 +150,7 @@ def test_long_sources_say_first_what_they_are(folder):
 
 @pytest.mark.parametrize("folder", sorted(set(MAY_INCLUDE) - WIDE_COMMENTS))
 def test_comments_of_sources_are_narrower_than_code(folder):
-    """clang-format breaks lines of code and of comments at one limit; ruff has a limit
+    """clang-format breaks code and comments at the same width, whereas ruff has a limit
     for each."""
     wide = []
     for path in (CSRC / folder).iterdir():
@@ -164,7 +167,7 @@ def test_operation_has_a_test(operation):
 
 
 def test_every_test_has_its_kind():
-    """Markers go by the folder; conftest.py says which kind is what."""
+    """Markers are set by the folder; conftest.py describes the kinds."""
     tests = (path.relative_to(ROOT / "tests") for path in (ROOT / "tests").rglob("test_*.py"))
     assert [str(path) for path in tests if path.parts[0] not in KINDS] == []
 
@@ -175,8 +178,8 @@ def test_headers_are_included_once():
 
 
 def folders_included(folder):
-    """Folders of csrc/ that the sources of one of them include, and which source that
-    is."""
+    """Return the folders of csrc/ that the sources of a folder include, each with a
+    source that does so."""
     for path in (CSRC / folder).iterdir():
         if path.suffix in {".h", ".cpp", ".cu", ".cuh"}:
             for name in re.findall(
@@ -198,7 +201,8 @@ def test_folder_includes_only_what_it_may(folder):
 
 
 def test_precision_is_chosen_by_lists_of_files():
-    """A pattern on names would change how a file rounds when somebody renames it."""
+    """If a pattern on file names chose the precision, renaming a file would change how
+    it rounds."""
     text = (ROOT / "CMakeLists.txt").read_text(encoding="utf-8")
     assert "FILTER" not in text
     assert set(cmake_list("V3DG_CUDA_QUICK_SOURCES")) < {
@@ -208,14 +212,14 @@ def test_precision_is_chosen_by_lists_of_files():
 
 
 def cmake_list(name):
-    """Sources in a list of CMakeLists.txt."""
+    """Return the sources in a list of CMakeLists.txt."""
     text = (ROOT / "CMakeLists.txt").read_text(encoding="utf-8")
     return re.search(rf"set\({name}\s([^)]*)\)", text)[1].split()
 
 
 def test_host_sources_know_nothing_of_the_cuda_runtime():
-    """What is compiled without CUDA, too, sees CUDA only through the contracts or
-    behind V3DG_WITH_CUDA."""
+    """Sources that are also compiled without CUDA use CUDA only through the contracts
+    or behind V3DG_WITH_CUDA."""
     behind_the_flag = re.compile(
         r"^#if V3DG_WITH_CUDA$.*?^#(?:else|endif)", re.MULTILINE | re.DOTALL
     )
@@ -234,7 +238,8 @@ def test_host_sources_know_nothing_of_the_cuda_runtime():
 
 
 def test_bindings_ask_for_the_backend_in_one_place():
-    """Everything else goes through the seam, whose head says how to add a backend."""
+    """All other code uses the interface of backends, whose head comment says how to add
+    one."""
     sources = {
         path: path.read_text(encoding="utf-8")
         for path in (CSRC / "bindings").iterdir()
@@ -256,7 +261,7 @@ def test_bindings_ask_for_the_backend_in_one_place():
 
 
 def test_only_the_backend_of_cuda_sees_cuda():
-    """Bindings that are compiled without CUDA include no header of its half."""
+    """Bindings that are compiled without CUDA include no header of the CUDA part."""
     halves = re.compile(
         r'#include "(?:base/(?:device|device_guard|stream)\.h|.*_cuda\w*\.h|.*\.cuh)"'
     )
@@ -270,13 +275,14 @@ def test_only_the_backend_of_cuda_sees_cuda():
 
 
 def test_kernels_are_started_by_launch_alone():
-    """It checks that they start, and gives them the shared memory that they ask for."""
+    """This function checks that a kernel starts, and sets the shared memory that it
+    needs."""
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".cu", ".cuh"} and p.name != "launch.cuh"]
     assert [str(p) for p in sources if "<<<" in p.read_text(encoding="utf-8")] == []
 
 
 def test_bindings_give_pythons_lock_up_by_a_type_of_ours():
-    """With pybind11's, a thread that Python ends aborts the process
+    """With the type of pybind11, a thread that is ended by Python aborts the process
     (bindings/python_lock.h)."""
     pythons = re.compile(r"gil_scoped|PyEval_\w+Thread|PyGILState_Ensure|Py_BEGIN_ALLOW_THREADS")
     users = [
@@ -288,15 +294,15 @@ def test_bindings_give_pythons_lock_up_by_a_type_of_ours():
 
 
 def imports_of(path, *, inside_functions):
-    """Modules that a Python file imports, except for type checkers; and the names that
-    it takes from them."""
+    """Return the modules that a Python file imports, except for type checkers, and the
+    names that it imports from them."""
     names, todo = set(), [ast.parse(path.read_text(encoding="utf-8"))]
     while todo:
         node = todo.pop()
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            names |= {node.module} - {"v3dg"}  # whose modules are taken from it, too
+            names |= {node.module} - {"v3dg"}  # a package from which modules are imported, too
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             todo += node.orelse
@@ -306,25 +312,26 @@ def imports_of(path, *, inside_functions):
 
 
 def imports_when_loaded(path):
-    """Modules that a Python file imports as it is loaded."""
+    """Return the modules that a Python file imports when it is loaded."""
     return imports_of(path, inside_functions=False)
 
 
 def room_of(name):
-    """The module or package right in v3dg/ that a module is, or is in."""
+    """Return the module or package directly in v3dg/ that a module is or belongs to."""
     return f"{name}.__init__".split(".")[1]
 
 
 def rooms_imported(path, rooms):
-    """Modules and packages right in v3dg/ that a file imports."""
+    """Return the modules and packages directly in v3dg/ that a file imports."""
     for name in imports_of(path, inside_functions=True):
         if name.split(".")[0] == "v3dg":
             room = room_of(name)
-            yield room if room in rooms else "__init__"  # which has the public names
+            yield room if room in rooms else "__init__"  # contains the public names
 
 
 def order_of_v3dg():
-    """Each after what it imports, as CONTRIBUTING.md promises."""
+    """Return the modules of v3dg in the order of CONTRIBUTING.md: each follows those
+    that it imports."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     return re.search(r"imports only what stands before it.*?```text\n(.*?)```", text, re.DOTALL)[
         1
@@ -352,7 +359,7 @@ def test_modules_do_not_import_in_a_circle():
     }
     below = {}
     for name, path in modules.items():
-        # What a module takes from the package that it is in is another module of it.
+        # What a module imports from its own package is another module of that package.
         below[name] = {
             m
             for m in imports_when_loaded(path) & modules.keys()
@@ -399,7 +406,8 @@ def test_extras_are_told_by_the_names_that_pip_has():
 
 
 def test_every_result_is_named():
-    """By a page, or by the program that reads it; what nothing names is not read."""
+    """A page names it, or a program reads it. Results that nothing names are not
+    read."""
     pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]
     programs = [*(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.md")]
     text = "\n".join(path.read_text(encoding="utf-8") for path in (*pages, *programs))

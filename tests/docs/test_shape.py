@@ -1,5 +1,5 @@
-"""The shape of the library's code: counts over the syntax tree of v3dg/ that may only
-fall.
+"""Limits for the shape of the code in v3dg/, counted in its syntax tree; the counts may
+only fall.
 
 A limit on the total of lines can be met by packing, which makes code harder to read.
 Each of these counts falls only when code is unpacked. `LIMITS` holds what each package
@@ -30,10 +30,10 @@ TOP = "v3dg"
 MOST_LINES_A_FUNCTION = 40
 MOST_POSITIONAL = 6
 
-# Words that relate parts of a phrase and do not say what a value is: away from the line
-# that binds it such a name tells nothing, and no search finds it. Words that also name
-# a thing are left out where that is what they mean here: `left` and `right` (sides),
-# `now` (a time), `first`, `last`, `start` and `end` (positions).
+# Words that relate the parts of a phrase and do not say what a value is. Away from the
+# line that binds it, such a name tells nothing, and no search finds it. Words that also
+# name a thing are left out where they have that meaning here: `left` and `right`
+# (sides), `now` (a time), `first`, `last`, `start` and `end` (positions).
 _PREPOSITIONS_AND_ADVERBS = """
     of by at in to from for with without over under above below about around after before behind
     beside between beyond inside outside into onto per since until till through toward towards
@@ -66,14 +66,14 @@ Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 class Place(NamedTuple):
-    """Something that is counted."""
+    """A place in the code that is counted."""
 
     kind: str
     line: int
     text: str
 
 
-# What is counted, by its heading in the table.
+# The counted kinds, by their headings in the table.
 KINDS = {
     "code": "lines that are neither blank nor a comment nor a docstring",
     "packed": "several values assigned to several targets, and several statements on a line",
@@ -90,7 +90,7 @@ LIMITED = ("packed", "conditional", "words", "Any", "**Any", "long", "positional
 
 
 def lines_of_code(text: str) -> set[int]:
-    """Numbers of the lines with a token of code; docstrings, comments and blank lines
+    """Return the numbers of the lines with code. Docstrings, comments and blank lines
     have none."""
     nothing = {"COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER"}
     lines: set[int] = set()
@@ -108,8 +108,8 @@ def lines_of_code(text: str) -> set[int]:
 
 
 def is_packed(node: ast.AST) -> bool:
-    """Whether an assignment binds several targets, and is not the unpacking of one
-    value, nor a swap."""
+    """Return whether an assignment binds several targets, and neither unpacks one value
+    nor swaps values."""
     if not isinstance(node, ast.Assign):
         return False
     if len(node.targets) > 1:
@@ -123,7 +123,8 @@ def is_packed(node: ast.AST) -> bool:
 
 
 def crowded_lines(tree: ast.AST) -> Iterator[int]:
-    """Lines on which a statement follows another one, or the header of its block."""
+    """Return the lines on which a statement follows another statement or the header of
+    its block."""
     for node in ast.walk(tree):
         for name in ("body", "orelse", "finalbody"):
             block = getattr(node, name, None)
@@ -140,7 +141,7 @@ def crowded_lines(tree: ast.AST) -> Iterator[int]:
 
 
 def bound_name(node: ast.AST) -> str | None:
-    """The name that a node binds: of a variable, a loop target, a parameter, an
+    """Return the name that a node binds: of a variable, a loop target, a parameter, an
     attribute or an exception."""
     match node:
         case ast.Name(id=name, ctx=ast.Store()):
@@ -172,7 +173,7 @@ COUNTED_NODES = {
 
 
 def places(text: str) -> Iterator[Place]:
-    """All that is counted in a file."""
+    """Return all counted places in a file."""
     tree = ast.parse(text)
     code = lines_of_code(text)
     for line in code:
@@ -196,7 +197,7 @@ def places_of_function(function: Function, code: set[int]) -> Iterator[Place]:
     arguments = function.args
     if arguments.kwarg is not None and is_any(arguments.kwarg.annotation):
         yield Place("**Any", function.lineno, function.name)
-    # The lines of a long signature count, those of a docstring do not.
+    # The lines of a long signature count, but not those of a docstring.
     num_lines = len(code.intersection(range(function.lineno, function.end_lineno + 1)))
     if num_lines > MOST_LINES_A_FUNCTION:
         yield Place("long", function.lineno, f"{function.name}: {num_lines} lines")
@@ -220,8 +221,8 @@ def counts_of_packages() -> dict[str, Counter[str]]:
 
 
 def table(packages: dict[str, Counter[str]]) -> str:
-    """Counts, and in brackets those for a thousand lines of code, or the share of all
-    names."""
+    """Return a table of the counts. In brackets it has the counts per thousand lines of
+    code, or the share of all names."""
     total: Counter[str] = Counter()
     for counts in packages.values():
         total.update(counts)
@@ -240,7 +241,7 @@ def table(packages: dict[str, Counter[str]]) -> str:
     return "\n".join("  ".join(map(str.rjust, row, widths)) for row in rows)
 
 
-# What each package counts, in the order of LIMITED.
+# The limits of each package, in the order of LIMITED.
 LIMITS = {
     "v3dg": (0, 0, 0, 5, 0, 0, 0),
     "_urls": (0, 0, 0, 0, 0, 0, 0),

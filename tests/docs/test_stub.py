@@ -1,4 +1,4 @@
-"""`v3dg/_core.pyi` says what the compiled module has: names, properties, and parameters
+"""`v3dg/_core.pyi` describes the compiled module: its names, properties, and parameters
 in their order."""
 
 import ast
@@ -20,19 +20,19 @@ READ_ONLY, WRITABLE = "a property that is only read", "an attribute"
 
 
 class Parameter(NamedTuple):
-    name: str  # empty where it can be given by its place alone
+    name: str  # empty for a parameter that can be given by position only
     kind: str
     has_default: bool
 
 
 def parameters_of(definition):
-    """Parameters of a function without self."""
+    """Return the parameters of a function without self."""
     given = definition.args
     places = [*given.posonlyargs, *given.args]
     defaults = [None] * (len(places) - len(given.defaults)) + given.defaults
     found = []
     for a, default in zip(places, defaults, strict=True):
-        # What a binding gives no name is called arg0, arg1 and so on.
+        # pybind11 calls parameters without a name arg0, arg1 and so on.
         has_name = a not in given.posonlyargs and not re.fullmatch(r"arg\d+", a.arg)
         if a.arg != "self":
             found.append(Parameter(a.arg if has_name else "", "", default is not None))
@@ -46,19 +46,19 @@ def parameters_of(definition):
 
 
 def signatures_in_docstring(name, text):
-    """Parameters of each overload, from the lines that pybind11 begins a docstring
-    with."""
+    """Return the parameters of each overload, from the first lines of a docstring of
+    pybind11."""
     overloads = re.findall(rf"^\d+\. {name}(\(.*)$", text, re.MULTILINE)
     lines = overloads or re.findall(rf"\A{name}(\(.*)", text)
     assert lines, f"{name}: expected a docstring with a signature, got {text!r}"
-    # Python has no literal for some defaults: those are written as <...>.
+    # Python has no literal for some defaults, which are written as <...>.
     definitions = [f"def {name}{re.sub(r'= <[^>]*>', '= ...', line)}: ..." for line in lines]
     return {parameters_of(ast.parse(definition).body[0]) for definition in definitions}
 
 
 def members_of_module(owner):
-    """What a module or class has by name: signatures, the members of a class, or the
-    kind of attribute."""
+    """Return the members of a module or class by name: signatures, the members of a
+    class, or the kind of attribute."""
     if isinstance(owner, enum.EnumMeta):
         return dict.fromkeys(owner.__members__, WRITABLE)
     found = {}
@@ -69,7 +69,7 @@ def members_of_module(owner):
             found[name] = READ_ONLY if value.fset is None else WRITABLE
         elif not callable(value):
             found[name] = WRITABLE
-        # One of object's.
+        # Every class inherits this one from object.
         elif is_compared(name) and not isinstance(value, types.WrapperDescriptorType):
             found[name] = signatures_in_docstring(name, getattr(owner, name).__doc__)
     return public(found)
@@ -82,7 +82,7 @@ def members_of_stub(body):
             found[node.name] = members_of_stub(node.body)
         elif isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) != "TypeAlias":
             found[node.target.id] = WRITABLE
-        elif isinstance(node, ast.Assign):  # in an enum
+        elif isinstance(node, ast.Assign):  # values of an enum
             found |= {target.id: WRITABLE for target in node.targets}
         elif isinstance(node, ast.FunctionDef):
             decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
@@ -98,7 +98,8 @@ def is_compared(name):
 
 
 def public(members):
-    """Without a constructor that takes nothing, too: a stub need not say it."""
+    """Return the public members. A constructor without parameters is left out, because
+    a stub may omit it."""
     return {
         name: member
         for name, member in members.items()
@@ -107,8 +108,8 @@ def public(members):
 
 
 def as_built(stub, module):
-    """What of the stub the module must have: without CUDA, not what the bindings have
-    for CUDA alone."""
+    """Return the part of the stub that the module must have: without CUDA, it has no
+    bindings for CUDA."""
     if _core.has_cuda or not (isinstance(stub, dict) and isinstance(module, dict)):
         return stub
     return {

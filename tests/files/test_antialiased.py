@@ -1,4 +1,5 @@
-"""Whether an asset was trained with antialiasing: read, kept, drawn and built with."""
+"""Whether an asset was trained with antialiasing is read, kept, and used for drawing
+and building."""
 
 import copy
 import json
@@ -58,7 +59,7 @@ def test_files_keep_it(tmp_path, name, antialiased):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_files_say_nothing_where_nothing_is_known(tmp_path, name):
-    """A `.spz` has a bit for it, which says no."""
+    """A `.spz` file always has a bit for it, which is 0 then."""
     v3dg.write_asset(tmp_path / name, ASSET)
     assert declared(tmp_path / name) is (False if name == "a.spz" else None)
 
@@ -95,7 +96,7 @@ COMMENTS = {
 @pytest.mark.parametrize("case", COMMENTS)
 @pytest.mark.parametrize("place", ["before", "after"])
 def test_comments_of_trainers_are_understood(tmp_path, case, place):
-    """Wherever they are in the header."""
+    """The comments may be anywhere in the header."""
     comments, wanted = COMMENTS[case]
     content = ply_bytes([Element("vertex", random_columns(2, 0))], "ascii")
     lines = "".join(f"comment {comment}\n" for comment in comments).encode()
@@ -116,7 +117,7 @@ def test_a_mode_that_is_not_known_is_told(tmp_path):
 
 
 def with_meta(path, **fields):
-    """A `.sog` with these fields in its meta.json."""
+    """Return a `.sog` file with these fields in its meta.json."""
     contents = sog.encode(ASSET)
     meta = json.loads(contents["meta.json"])
     contents["meta.json"] = json.dumps({**meta, **fields}).encode()
@@ -215,8 +216,8 @@ CAMERA = v3dg.Camera.look_at((0, -20, 0), (0, 0, 0), width=48, height=48, fov_x=
 
 
 def test_an_asset_is_drawn_as_it_was_trained(tmp_path):
-    """From afar, where a filter without compensation would make it thicker, and no
-    filter makes it flicker."""
+    """From afar, a filter without compensation would make it thicker, and without a
+    filter it would flicker."""
     asset = ASSET.trained(antialiased=True)
     v3dg.write_asset(tmp_path / "a.ply", asset)
     asset = v3dg.read_asset(tmp_path / "a.ply")
@@ -234,7 +235,7 @@ def test_an_asset_is_drawn_as_it_was_trained(tmp_path):
 
 
 def look_of(bundle):
-    """Filter and compensation of the clusters of level 0."""
+    """Return the filter and the compensation of the clusters of level 0."""
     level = bundle.clusters.level == 0
     filters = set(bundle.clusters.filter_px2[level].tolist())
     return filters, set(bundle.clusters.antialiased[level].tolist())
@@ -295,7 +296,8 @@ def test_files_that_have_axes_declare_all_together(tmp_path):
 
 
 def test_leaves_on_disk_keep_it(tmp_path):
-    """An asset that is sorted on disk has no gaussians in memory that could say it."""
+    """An asset that is sorted on disk has no gaussians in memory that could record
+    it."""
     v3dg.write_asset(tmp_path / "a.ply", ASSET, antialiased=True)
     for most_in_memory in (len(ASSET), 10):
         with leaves_on_disk(

@@ -1,4 +1,4 @@
-"""Which way is up survives every file: turns to the axes of files and back."""
+"""The up axis survives every file: assets are rotated to the axes of files and back."""
 
 import gzip
 import itertools
@@ -22,7 +22,7 @@ from v3dg.rotations import normalised, rotation_from_quaternion
 from v3dg.upright import direction_of, up_of
 
 LETTERS = ("LR", "UD", "BF")
-# Numbers of the extension SPZ_ADOBE_coordinate_system, of version 4 of Niantic's
+# Numbers in the extension SPZ_ADOBE_coordinate_system of version 4 of Niantic's
 # library.
 RECORDS = [
     *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
@@ -46,7 +46,8 @@ def covariances(gaussians):
 
 
 def colors(gaussians, directions):
-    """(N, 3) the colour of each gaussian in a direction of its own, not cut at 0."""
+    """Return (N, 3) the colour of each gaussian in its own direction, without clamping
+    at 0."""
     return np.einsum("nk,nkc->nc", basis(directions, gaussians.sh_degree), gaussians.sh)
 
 
@@ -66,7 +67,8 @@ def test_all_axes_are_turned_to_and_mirrored(asset, axes):
     np.testing.assert_allclose(back.sh, asset.sh, atol=1e-5)
 
 
-@pytest.mark.parametrize("axes", ["RUB", "LDF", "RFU"])  # half a turn, mirrored, a quarter
+# Half a turn, a reflection, and a quarter of a turn.
+@pytest.mark.parametrize("axes", ["RUB", "LDF", "RFU"])
 @pytest.mark.parametrize("antialiased", [True, False, None])
 def test_turns_keep_antialiasing(asset, axes, antialiased):
     marked = asset.trained(antialiased=antialiased)
@@ -95,7 +97,7 @@ def test_what_is_up_is_up_in_axes_of_that_name(up):
 @pytest.mark.parametrize("up", AXES)
 @pytest.mark.parametrize("suffix", [".glb", ".spz", ".usda"])
 def test_what_is_up_stands_up_in_files_that_have_axes(tmp_path, asset, suffix, up):
-    """The raw numbers of the file have up at +y, whatever was up before."""
+    """The raw numbers in the file have +y up, whatever was up before."""
     if suffix == ".usda":
         pytest.importorskip("pxr")
     path = tmp_path / f"a{suffix}"
@@ -124,7 +126,8 @@ def test_another_name_for_up_is_refused(tmp_path, asset):
 
 
 def stored_means(path):
-    """Positions as the bytes of a file have them, in no one's axes."""
+    """Return the positions as they are stored in a file, before any axes are
+    changed."""
     if path.suffix == ".usda":
         from pxr import Usd
 
@@ -178,7 +181,7 @@ def test_spz_with_an_unknown_number_of_axes_is_refused(tmp_path, asset):
 
 
 def outdoors(rng, count=3000, ground=0.4):
-    """(N, 3) a wide ground at the height 0 with things above it; z is up."""
+    """Return (N, 3) a wide ground at height 0 with things above it; z is up."""
     num_ground = int(ground * count)
     plane = rng.uniform(-10, 10, (num_ground, 2))
     things = rng.normal(0, 3, (count - num_ground, 2))
@@ -189,7 +192,7 @@ def outdoors(rng, count=3000, ground=0.4):
 
 
 def standing(means):
-    """An asset at these positions."""
+    """Return an asset at these positions."""
     blobs = random_gaussians(len(means), 1)
     return Gaussians(
         np.ascontiguousarray(means, np.float32),
@@ -201,7 +204,8 @@ def standing(means):
 
 
 def write_without_record(path, asset):
-    """A `.spz` as most programs write it: the numbers of memory, and no record."""
+    """Write a `.spz` file like most programs: the numbers in memory, without a record
+    of the axes."""
     write_asset(path, half_turn(asset, "x"))
     content = bytearray(gzip.decompress(path.read_bytes()))[:-12]
     content[14] = 0

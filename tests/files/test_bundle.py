@@ -43,7 +43,7 @@ some_bundles = st.builds(
 
 
 def page_content(bundle, page):
-    """Bytes of a page, without what it is filled up with."""
+    """Return the bytes of a page without padding."""
     gaussians, clusters = bundle.read_page(page), bundle.page_range(page)
     if bundle.codec == "quantized":
         offset = bundle.clusters.offset[clusters.start : clusters.stop + 1]
@@ -68,7 +68,7 @@ def assert_same_tables(a, b):
 
 @pytest.fixture(params=CODECS)
 def saved(tmp_path, request):
-    """A small bundle of three levels and its file."""
+    """A small bundle of three levels, and its file."""
     bundle = random_bundle(3, config={"seed": 3}, codec=request.param)
     path = tmp_path / "small.v3dg"
     bundle.write(path)
@@ -76,13 +76,14 @@ def saved(tmp_path, request):
 
 
 class Reads:
-    """Counts the bytes that this process reads, whichever part of it does."""
+    """Counts the bytes that any part of this process reads."""
 
     def __init__(self):
         self.num_bytes = 0
 
     def _look(self):
-        """What the system has counted, and what looking adds to that."""
+        """Return the system's count, and the bytes that reading this count adds to
+        it."""
         text = Path("/proc/self/io").read_text()
         return int(re.search(r"^rchar: (\d+)$", text, re.MULTILINE)[1]), len(text)
 
@@ -105,7 +106,8 @@ def reads():
 
 
 def split_file(data):
-    """A file's header as a dict, and its tensors as arrays that can be changed."""
+    """Return a file's header as a dict, and its tensors as arrays that can be
+    changed."""
     header_bytes = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + header_bytes])
     tensors = {}
@@ -121,8 +123,8 @@ def split_file(data):
 
 
 def join_file(header, tensors):
-    """The file of a header, as it is given, and tensors in the header's order, with a
-    hash that fits."""
+    """Return the file of this header and of these tensors in the header's order, with
+    the correct hash."""
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
     version = re.search(rb'"version": "([0-9]{1,9})"', text)
     text += b" " * (-(8 + len(text)) % (16 if b'"codec": "quantized"' in text else 4096))
@@ -133,14 +135,14 @@ def join_file(header, tensors):
 
 
 def open_changed(path, change):
-    """Open the file after ``change(header, tensors)``, which leaves its hash right."""
+    """Open the file after ``change(header, tensors)``; its hash is correct."""
     header, tensors = split_file(path.read_bytes())
     header = change(header, tensors) or header
     path.write_bytes(join_file(header, tensors))
     return Bundle.open(path)
 
 
-# Round trips
+# Round trips.
 
 
 @settings(max_examples=50)
@@ -175,7 +177,7 @@ def test_official_reader_sees_the_same(tmp_path_factory, bundle):
         pages = file.get_slice("pages")
         places = [*file.get_tensor("pages.offset").tolist(), pages.get_shape()[0]]
         for page, (first, end) in enumerate(itertools.pairwise(places)):
-            if first < end:  # it refuses to slice an empty tensor
+            if first < end:  # it cannot slice an empty tensor
                 content = page_content(bundle, page)
                 assert pages[first:end].tobytes() == content + bytes(end - first - len(content))
 
@@ -268,7 +270,7 @@ def test_opened_gaussians_can_be_written(saved):
 
 
 def test_tables_cannot_be_changed_after_they_were_checked(saved):
-    """Drawing trusts them: an offset that is wrong would read anywhere."""
+    """Drawing relies on the tables: a wrong offset would read any memory."""
     bundle, path = saved
     built = v3dg.build_bundle(
         bundle.level_gaussians(0), config=v3dg.BuildConfig(steps=0), progress=False
@@ -320,7 +322,7 @@ def test_copies_go_through_pickle(saved):
         assert_same_gaussians(copy.gaussians, bundle.gaussians)
 
 
-# Lazy
+# Pages that are read when they are needed.
 
 
 def test_opening_reads_no_page(saved, reads):
@@ -354,7 +356,7 @@ def test_a_level_reads_its_pages_only(saved, reads):
 
 
 def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
-    """One cluster a page as a build makes them, 40 MB a page, so that the tables stay
+    """A page has one cluster, as in builds, and 40 MB, so that the tables stay
     small."""
     num_levels, per_cluster = 256, 200_000
     level = np.arange(num_levels, dtype=np.int32)
@@ -423,7 +425,7 @@ def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
     assert reads.num_bytes < 100_000 + page_file_bytes
 
 
-# Damage
+# Damage.
 
 
 def test_every_truncation_is_refused(saved):
@@ -496,7 +498,7 @@ def test_damage_of_a_file_with_an_odd_name_is_told(tmp_path):
 
 
 def test_a_page_that_the_system_cannot_read_is_named(saved, tmp_path):
-    """A folder opens, but is not read."""
+    """A folder can be opened, but not read."""
     opened = Bundle.open(saved[1])
     folder = os.open(tmp_path, os.O_RDONLY)
     os.dup2(folder, opened._file._fd)
@@ -507,7 +509,7 @@ def test_a_page_that_the_system_cannot_read_is_named(saved, tmp_path):
         opened.read_page(0)
 
 
-# Hostile files
+# Hostile files.
 
 
 @pytest.mark.parametrize(
@@ -790,15 +792,15 @@ def test_random_headers_open_or_are_refused(tmp_path_factory, data):
     assert_opens_or_is_refused(path)
 
 
-# Quantised pages
+# Quantised pages.
 
 
 @pytest.mark.parametrize(
     ("version", "codec"), [(1, "float32"), (2, "quantized"), (3, "float32"), (3, "quantized")]
 )
 def test_golden_files_of_all_versions_are_read(version, codec, tmp_path):
-    """What was written once stays readable, to the same bits; what is written is of the
-    newest version."""
+    """Files of old versions stay readable with the same bits. New files have the newest
+    version."""
     path, bundle = golden_bundles.path_of(version, codec), golden_bundles.bundle_of(codec)
     opened = Bundle.open(path)
     info = opened.info()
@@ -814,7 +816,7 @@ def test_golden_files_of_all_versions_are_read(version, codec, tmp_path):
 def test_damage_of_tables_is_found_in_all_versions(version, codec, tmp_path):
     data = bytearray(golden_bundles.path_of(version, codec).read_bytes())
     path = tmp_path / "damaged.v3dg"
-    for place in (len(data) - 1, len(data) - 17):  # of the file's hash, and of a page's
+    for place in (len(data) - 1, len(data) - 17):  # of the hash of the file, and of a page's hash
         data[place] ^= 1
         path.write_bytes(data)
         with pytest.raises(ValueError, match="hash: does not match the header and the tables"):
@@ -864,7 +866,7 @@ def test_unknown_codecs_ask_for_an_update(tmp_path):
 @settings(max_examples=80)
 @given(data=st.data())
 def test_random_pages_are_finite_gaussians_or_refused(tmp_path_factory, data):
-    """Whose hashes are right: whoever wrote them meant it."""
+    """Their hashes are correct, as if the writer intended this content."""
     path = tmp_path_factory.mktemp("pages") / "small.v3dg"
     bundle = random_bundle(3, sh_degree=data.draw(st.integers(0, 3)), codec="quantized")
     bundle.write(path)
@@ -892,11 +894,11 @@ def test_random_pages_are_finite_gaussians_or_refused(tmp_path_factory, data):
             assert (gaussians.scales > 0).all()
 
 
-# Saving
+# Saving.
 
 
 class Stop(BaseException):
-    """Stands for whatever ends a write, Ctrl-C included."""
+    """Stands for any interruption of a write, such as Ctrl-C."""
 
 
 def test_an_interrupted_save_changes_nothing(saved, monkeypatch):
@@ -936,8 +938,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(saved, monkeypatch):
 
 
 def test_a_half_written_file_is_refused_and_replaced(saved):
-    """What a lost power supply leaves is another file, that nobody takes for a
-    bundle."""
+    """After a power failure another file remains, which is never read as a bundle."""
     bundle, path = saved
     leftover = path.with_name(".small.v3dg.0123456789abcdef.tmp")
     leftover.write_bytes(path.read_bytes()[:-100])
@@ -992,7 +993,7 @@ def test_saved_files_have_usual_permissions(saved):
     assert path.stat().st_mode & 0o777 == 0o666 & ~umask
 
 
-# Construction
+# Construction.
 
 
 def test_tables_of_wrong_kind_are_refused(saved):
@@ -1042,7 +1043,7 @@ def test_a_ball_that_barely_sticks_out_is_refused():
 
 def test_config_that_no_reader_would_accept_is_refused(saved):
     bundle, path = saved
-    # The config alone is within the limit, the header is not.
+    # The config alone is within the limit, but the header is not.
     large = Bundle(
         bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * ((1 << 20) - 100)}
     )

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from v3dg import Camera, read_cameras, write_cameras
 
 MATRIX = [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 1], [0, 0, 0, 1]]
-# Seen from (0, -5, 1) along y, z upwards.
+# The camera is at (0, -5, 1) and looks along y, with z up.
 VIEWMAT = [[1, 0, 0, 0], [0, 0, -1, 1], [0, 1, 0, 5], [0, 0, 0, 1]]
-# What a capture's processing writes, without its lens.
+# The fields that the processing of a capture writes, without those of the lens.
 CAPTURE = {
     "camera_model": "OPENCV",
     "w": 640,
@@ -32,7 +32,8 @@ CAPTURE = {
         {"file_path": "images/frame_2.png", "transform_matrix": MATRIX, "fl_x": 600, "w": 320.0},
     ],
 }
-# NeRF's synthetic scenes: the size is that of the pictures, which are not looked at.
+# In the synthetic scenes of NeRF, the size is that of the pictures, whose files are not
+# read here.
 SYNTHETIC = {
     "camera_angle_x": 0.69,
     "frames": [
@@ -55,8 +56,8 @@ def test_a_capture_is_read(tmp_path):
     np.testing.assert_allclose(first.viewmat, VIEWMAT, atol=1e-15)
     np.testing.assert_array_equal(first.K, [[500, 0, 321.5], [0, 510, 238.5], [0, 0, 1]])
     assert (first.width, first.height, first.near) == (640, 480, 0.01)
-    # A frame's own focal length stands for both axes: the file's fl_y belongs to the
-    # other lens.
+    # The focal length of a frame holds for both axes, because the file's fl_y belongs
+    # to the other lens.
     assert (second.fx, second.fy, second.width, second.height) == (600, 600, 320, 480)
 
 
@@ -83,7 +84,7 @@ def test_vertical_field_of_view_is_used(tmp_path):
 
 def test_applied_transform_is_undone_on_request(tmp_path):
     path = put(tmp_path, {**CAPTURE, "applied_scale": 2})
-    point = np.array([0.3, -0.2, 0.7])  # where the data was before
+    point = np.array([0.3, -0.2, 0.7])  # the place of the data before it was moved
     in_file = 2 * np.array(CAPTURE["applied_transform"]) @ [*point, 1]
     kept = next(iter(read_cameras(path).values()))
     undone = next(iter(read_cameras(path, applied_transform="undo").values()))
@@ -285,7 +286,7 @@ def test_unknown_choices_are_refused(tmp_path, argument):
 
 
 def cameras_of_3dgs(cameras):
-    """What the code of the 3DGS paper writes for cameras."""
+    """Return the cameras that the code of the 3DGS paper writes for these cameras."""
     entries = []
     for number, (name, camera) in enumerate(cameras.items()):
         to_world = np.linalg.inv(camera.viewmat)

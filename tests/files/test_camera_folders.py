@@ -1,4 +1,4 @@
-"""Cameras of COLMAP's models, written by COLMAP's own library, and of nerfstudio's
+"""Cameras of COLMAP models, written by COLMAP's own library, and cameras of nerfstudio
 runs."""
 
 import json
@@ -19,7 +19,7 @@ pycolmap = pytest.importorskip("pycolmap")
 
 
 def write_model(folder, cameras, *, model="PINHOLE", extra=(), text=False):
-    """A model of COLMAP, of images that have the names of cameras."""
+    """Write a COLMAP model of images with the names of cameras."""
     reconstruction = pycolmap.Reconstruction()
     for number, (name, camera) in enumerate(cameras.items(), start=1):
         params = [camera.fx, camera.fy, camera.cx, camera.cy, *extra]
@@ -105,7 +105,7 @@ def test_no_name_makes_a_camera_vanish(tmp_path, kind, text):
     rng = np.random.default_rng(0)
     wanted = {name: random_camera(rng) for name in NAMES[kind]}
     write_model(tmp_path / "a", wanted, text=text)
-    if text:  # which has no place for spaces before a name
+    if text:  # this format cannot store spaces before a name
         wanted = {name.lstrip(): camera for name, camera in wanted.items()}
     assert_same(read_cameras(tmp_path / "a"), wanted)
 
@@ -142,7 +142,7 @@ def test_a_name_in_another_encoding_is_kept_by_its_bytes(tmp_path, cameras):
 
 @pytest.mark.parametrize("text", [False, True])
 def test_rigs_place_their_cameras(tmp_path, text):
-    """A model of COLMAP 3.12: two cameras on a rig, at two moments."""
+    """The model is from COLMAP 3.12: a rig of two cameras at two times."""
     model = pycolmap.Reconstruction()
     rig = pycolmap.Rig(rig_id=1)
     lenses = [
@@ -202,8 +202,8 @@ def assert_maps_as_colmap(camera, theirs):
 
 
 def test_all_models_of_colmap_are_known(tmp_path):
-    """Which are pinholes, how many parameters they have, when they are without
-    distortion, and where they map points is what COLMAP says."""
+    """COLMAP itself says which models are pinholes, how many parameters they have, when
+    they have no distortion, and where they project points."""
     for name, kind in pycolmap.CameraModelId.__members__.items():
         if name == "INVALID":
             continue
@@ -221,7 +221,8 @@ def test_all_models_of_colmap_are_known(tmp_path):
             place.mkdir()
             model.write_binary(os.fspath(place))
             is_pinhole = theirs.is_perspective_pinhole()
-            # COLMAP calls every EUCM distorted, also where it is the plain pinhole.
+            # COLMAP calls every EUCM camera distorted, even if its parameters are those
+            # of a pinhole.
             is_plain = theirs.is_undistorted() or (name == "EUCM" and not theirs.params[4])
             if is_pinhole:
                 assert len(read_cameras(place, distortion="ignore")) == 1
@@ -230,7 +231,7 @@ def test_all_models_of_colmap_are_known(tmp_path):
                 continue
             with pytest.raises(ValueError, match=f"one of OpenCV's models, got {name}; undis"):
                 read_cameras(place)
-        assert int(kind) < 18  # the number of models that are known
+        assert int(kind) < 18  # the number of known models
 
 
 TEXTS = {
@@ -314,8 +315,8 @@ def test_models_that_claim_too_much_are_refused(tmp_path, cameras):
         path.write_bytes(good)
 
 
-# As nerfstudio 1.1 writes it: a run's settings as YAML with Python's objects, of which
-# many more follow.
+# nerfstudio 1.1 writes the settings of a run in this form: YAML with Python objects,
+# followed by many more.
 CONFIG = """\
 !!python/object:nerfstudio.engine.trainer.TrainerConfig
 _target: !!python/name:nerfstudio.engine.trainer.Trainer ''
@@ -333,8 +334,8 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
 
 @pytest.fixture
 def trained(tmp_path, cameras, monkeypatch):
-    """A run of nerfstudio, and its cameras in the frame of the gaussians: turned, moved
-    and scaled."""
+    """Return a nerfstudio run, and its cameras in the rotated, moved and scaled frame
+    of the gaussians."""
     monkeypatch.chdir(tmp_path)
     cameras = {name.replace("é", ""): camera for name, camera in cameras.items()}
     (tmp_path / "data" / "poster").mkdir(parents=True)
@@ -360,12 +361,12 @@ def test_a_run_has_its_cameras_where_its_gaussians_are(trained, monkeypatch, tmp
     assert_same(read_cameras(run), wanted)
     assert_same(read_cameras(run / "config.yml"), wanted)
     (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")  # the data is found from the run, too
+    monkeypatch.chdir(tmp_path / "elsewhere")  # the data is also found from the run
     assert_same(read_cameras(run), wanted)
 
 
 def test_what_was_applied_to_the_data_is_not_applied_twice(trained, tmp_path):
-    """The run's transform has it in it."""
+    """The transform of the run already includes it."""
     run, wanted = trained
     path = tmp_path / "data" / "poster" / "transforms.json"
     document = json.loads(path.read_text())
@@ -428,7 +429,8 @@ def test_the_viewer_offers_the_cameras_of_a_folder(tmp_path, monkeypatch, camera
 
 
 def test_a_folder_of_frames_is_read(tmp_path, trained):
-    """With the transform of a training beside it, in the frame of that training."""
+    """The transform of a training is beside it, so the cameras are in the frame of that
+    training."""
     run, wanted = trained
     folder = tmp_path / "data" / "poster"
     plain = read_cameras(folder / "transforms.json")

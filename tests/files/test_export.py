@@ -1,5 +1,5 @@
-"""`v3dg export`: bundles as streamed SOG, read back; docs/formats.md has them open in a
-viewer."""
+"""`v3dg export` writes bundles as streamed SOG, which is read back here.
+docs/formats.md describes how they look in a viewer."""
 
 import json
 import os
@@ -21,7 +21,8 @@ from v3dg.metrics import psnr
 
 
 def leaves_of(node):
-    """Leaves of the tree, whose inner nodes must hold their children."""
+    """Return the leaves of the tree, after checking that inner nodes contain their
+    children."""
     if "lods" in node:
         return [node]
     assert len(node["children"]) > 1
@@ -32,14 +33,15 @@ def leaves_of(node):
 
 
 def level_of_chunks(bundle, leaves):
-    """The level at which every chunk is a single group."""
+    """Return the level at which every chunk is a single group."""
     num_groups = np.bincount(bundle.groups.level, minlength=bundle.num_levels)
     return int(np.flatnonzero(num_groups == len(leaves))[0])
 
 
 def assert_holds(folder, bundle, chunk):
-    """Every leaf has gaussians at all levels; together the leaves have each gaussian of
-    the bundle's levels once, halves above those, and the files nothing else."""
+    """Assert that every leaf has gaussians at all levels, that the leaves together have
+    each gaussian of the bundle's levels once, and halves above those levels, and that
+    the files have nothing else."""
     index = json.loads((folder / "lod-meta.json").read_text())
     leaves = leaves_of(index["tree"])
     files = [v3dg.read_asset(folder / name) for name in index["filenames"]]
@@ -68,7 +70,8 @@ def assert_holds(folder, bundle, chunk):
 
 
 def assert_same(found, wanted):
-    """The same gaussians in any order, up to the rounding of SOG."""
+    """Assert that the gaussians are the same in any order, up to the rounding of
+    SOG."""
     order = np.lexsort(wanted.means.T)
     wanted = wanted.subset(order)
     squared = np.square(found.means[:, None].astype(float) - wanted.means).sum(axis=2)
@@ -101,8 +104,8 @@ def test_every_leaf_says_how_far_its_levels_are_from_the_finest(tmp_path, bundle
 
 
 def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
-    """Whatever its size; a level that is the finest has none, and one that is missing
-    that of the last."""
+    """The errors of a chunk of any size are those of its pictures. The finest level has
+    no error, and a missing level has the error of the last level."""
     finest, nothing = bundle.level_gaussians(0), bundle.level_gaussians(0).subset(slice(0, 0))
     half = finest.subset(slice(0, None, 2))
     errors = ChunkErrors()
@@ -111,8 +114,8 @@ def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
             errors.add(chunk, level.transform(scale=scale))
     first, second = errors.of_chunk[0], errors.of_chunk[1]
     assert first[0] == 0
-    assert first[1] < 1e-6  # pictures are kept rounded
-    # Every other gaussian is worse than a level of as many.
+    assert first[1] < 1e-6  # pictures are stored rounded
+    # Dropping every second gaussian is worse than a level with as many.
     assert 0 < 2 * first[2] < first[3] == first[4]
     np.testing.assert_allclose(first, second, rtol=1e-3)
 
@@ -128,11 +131,11 @@ def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
     )
     written = [file for file in (tmp_path / "web").rglob("*.*") if file.name != RECORD]
     assert done.bytes == sum(file.stat().st_size for file in written)
-    # So that a viewer can come down to a gaussian of each chunk.
+    # A viewer can then reduce each chunk to one gaussian.
     assert index["counts"][-1] == len(leaves)
     if chunk == 10**9:
         assert len(leaves) == 1
-    else:  # half of the chunk would do, or the tree would have been cut higher
+    else:  # half of the chunk would suffice, or the tree would have been cut higher
         assert max(leaf["lods"]["0"]["count"] for leaf in leaves) > chunk / 2 - 1
 
 
@@ -144,9 +147,27 @@ def test_the_finest_level_of_an_export_loads(tmp_path, bundle):
     )
 
 
+def test_the_folder_of_an_export_is_an_asset(tmp_path, bundle):
+    """As its index is, in Python and in commands, which name it after the folder."""
+    write_streamed_sog(bundle, tmp_path / "web", chunk=250)
+    loaded = v3dg.read_asset(tmp_path / "web")
+    wanted = v3dg.read_asset(tmp_path / "web" / "lod-meta.json")
+    np.testing.assert_array_equal(loaded.means, wanted.means)
+    assert asset_bytes(tmp_path / "web") == asset_bytes(tmp_path / "web" / "lod-meta.json")
+    done = run("render", "web", "--size", "16", "16", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "web.png").is_file()
+    done = run("build", "web", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "web.v3dg").is_file()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="expected a file name that ends in"):
+        v3dg.read_asset(tmp_path / "empty")
+
+
 def edited(tmp_path, bundle, **changes):
-    """The index of an export with other values at the top, or in its first leaf's
-    finest level."""
+    """Return the index of an export with other values at the top, or in the finest
+    level of its first leaf."""
     write_streamed_sog(bundle, tmp_path / "web", chunk=10**9)
     path = tmp_path / "web" / "lod-meta.json"
     index = json.loads(path.read_text())
@@ -226,8 +247,8 @@ def test_a_wrong_index_is_refused_before_a_chunk_is_decoded(tmp_path, bundle, ch
 
 @pytest.mark.parametrize("seed", range(6))
 def test_bundles_of_any_shape_are_exported(tmp_path, seed):
-    """Groups of several clusters, clusters without gaussians, one level or four, SH of
-    every degree."""
+    """There are groups of several clusters, clusters without gaussians, one level and
+    four, and SH of every degree."""
     bundle = random_bundle(seed, num_levels=1 + seed % 4, sh_degree=seed % 4, max_cluster=9)
     write_streamed_sog(bundle, tmp_path / "web", chunk=100)
     index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
@@ -241,8 +262,8 @@ def test_bundles_of_any_shape_are_exported(tmp_path, seed):
 
 
 def test_chunks_of_any_levels_are_one_picture_without_gaps(tmp_path, bundle):
-    """Above the level at which chunks are groups, too: every other chunk is one or two
-    levels coarser than its neighbours."""
+    """This also holds above the level at which chunks are groups: every second chunk is
+    one or two levels coarser than its neighbours."""
     write_streamed_sog(bundle, tmp_path / "web", chunk=250)
     index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
     leaves = leaves_of(index["tree"])
@@ -262,7 +283,7 @@ def test_chunks_of_any_levels_are_one_picture_without_gaps(tmp_path, bundle):
     top = level_of_chunks(bundle, leaves)
     for step in (1, 2):
         mixed = alpha([top + step * (number % 2) for number in range(len(leaves))])
-        # Shares of groups of several chunks have 0.90 and 0.89 here.
+        # The shares of groups with several chunks are 0.90 and 0.89 here.
         assert mixed[covered].mean() > 0.91
 
 
@@ -299,7 +320,7 @@ def test_an_earlier_export_is_replaced_and_kept_on_failure(tmp_path, bundle, mon
 def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):
     write_streamed_sog(bundle, tmp_path / "web")
     pose = json.loads((tmp_path / "web" / "settings.json").read_text())["cameras"][0]["initial"]
-    turn = np.diag([-1.0, -1.0, 1.0])  # of an asset in the viewer
+    turn = np.diag([-1.0, -1.0, 1.0])  # of the asset in the viewer
     position, target = (turn @ pose[name] for name in ("position", "target"))
     means = bundle.level_gaussians(0).means
     camera = v3dg.Camera.look_at(
@@ -314,8 +335,8 @@ def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):
 
 
 def rotation_between(points, turned):
-    """Which of the 24 rotations of a cube takes points, in any order, to where they are
-    turned."""
+    """Return the one of the 24 rotations of a cube that maps points to rotated points
+    in any order."""
     signed = [
         np.diag(signs)[:, order]
         for signs in product((1, -1), repeat=3)
@@ -331,7 +352,7 @@ def rotation_between(points, turned):
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_what_is_up_becomes_what_viewers_take_to_be_up(tmp_path, up):
-    """The asset looks the same from a camera that was turned with it."""
+    """The asset looks the same from a camera that is rotated with it."""
     from benchmarks.worlds.procedural import make_donut
 
     asset = make_donut(1000)
@@ -381,8 +402,8 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
 
 
 def test_info_of_an_export_has_the_size_of_all_its_files(tmp_path, bundle):
-    """Of every level and of the environment, once each; the page's settings are not
-    part of the asset."""
+    """The size counts every level and the environment once each. The page's settings
+    are not part of the asset."""
     path = edited(tmp_path, bundle, environment="3_0/meta.json")
     num_bytes = sum(file.stat().st_size for file in (tmp_path / "web").rglob("*.*"))
     num_bytes -= sum((tmp_path / "web" / name).stat().st_size for name in ("settings.json", RECORD))

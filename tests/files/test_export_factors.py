@@ -1,5 +1,5 @@
-"""Exports of scenes whose instances have an opacity or a tint: what a format cannot
-hold is told, and what is hidden is left out."""
+"""Exports of scenes whose instances have an opacity or a tint. The command reports what
+a format cannot store, and leaves out hidden instances."""
 
 import warnings
 

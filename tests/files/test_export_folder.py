@@ -1,5 +1,4 @@
-"""What exports do to the folders that they write to: nothing that is not their own is
-removed or replaced."""
+"""Exports remove or replace only their own files in the output folder."""
 
 import json
 import os
@@ -27,7 +26,7 @@ def write(request):
 
 @pytest.fixture
 def bundle(tmp_path):
-    """A bundle in a file, beside which nothing is exported."""
+    """A bundle in a file, in a folder without exports."""
     path = tmp_path / "data" / "a.v3dg"
     path.parent.mkdir()
     random_bundle(1, num_levels=3).write(path)
@@ -35,8 +34,8 @@ def bundle(tmp_path):
 
 
 def contents(folder):
-    """All that is below a folder by its name: bytes of files, targets of links,
-    permissions of folders."""
+    """Return everything below a folder by its name: bytes of files, targets of links,
+    and permissions of folders."""
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -48,8 +47,7 @@ def contents(folder):
 
 
 def project(folder):
-    """A folder with files of somebody, some of them with names that exports use,
-    too."""
+    """A folder with a user's files, some of them with names that exports use, too."""
     (folder / ".git").mkdir(parents=True)
     (folder / ".git" / "config").write_text("mine")
     (folder / "0_0").mkdir()
@@ -185,14 +183,15 @@ def test_a_file_that_was_changed_since_is_not_lost(tmp_path, bundle):
     ):
         write_site(bundle, folder)
     assert contents(folder) == before
-    write_streamed_sog(bundle, folder)  # which has no page
+    write_streamed_sog(bundle, folder)  # has no page
     assert (folder / "index.html").read_text() == "my page"
     write_site(bundle, folder, overwrite=True)
     assert "my page" not in (folder / "index.html").read_text()
 
 
 def test_a_file_that_is_in_the_way_of_a_new_one_stays(tmp_path, bundle):
-    """Also of a name that is known only when all is written."""
+    """This also holds for a name that is known only after everything else was
+    written."""
     folder = tmp_path / "web"
     write_tiles(bundle, folder)
     (folder / "0_0").mkdir()
@@ -328,7 +327,7 @@ def test_a_record_removes_no_file_with_another_content(tmp_path, bundle):
 
 
 class Moves:
-    """Has renaming fail at one of its calls."""
+    """Makes one of the calls that rename files fail."""
 
     def __init__(self, monkeypatch, moment, error):
         rename, self.count = os.rename, 0
@@ -363,8 +362,7 @@ def write_second(bundle, folder):
 
 
 def two_exports(tmp_path, bundle):
-    """What a folder has after an export of one kind, and after that of another, with a
-    file of somebody."""
+    """Return the content of a folder after exports of two kinds, with a user's file."""
     states = []
     for number, write in enumerate((write_first, write_second)):
         folder = tmp_path / str(number)
@@ -398,8 +396,8 @@ def test_an_export_that_fails_as_it_takes_its_place_is_whole_or_gone(
 
 
 def test_an_export_goes_back_where_one_before_was_killed(tmp_path, bundle, monkeypatch):
-    """At every move; what is there after the next one that fails is one of the two,
-    whole."""
+    """The export is killed at every move, and the next one fails; then the folder has
+    the whole content of one of the two."""
     earlier, later = two_exports(tmp_path, bundle)
     moment, was_killed = 0, True
     while was_killed:
@@ -502,7 +500,7 @@ def test_names_become_distinct():
 def test_usd_has_each_bundle_once_where_names_clash(tmp_path):
     pytest.importorskip("pxr")
     scene = v3dg.Scene()
-    for number in (1, 2):  # no name of a prim begins with a digit
+    for number in (1, 2):  # names of prims never begin with a digit
         random_bundle(number).write(tmp_path / f"{number}a.v3dg")
         scene.add(v3dg.Bundle.open(tmp_path / f"{number}a.v3dg"), positions=[[0, 0, 0]])
     v3dg.write_usd(scene, tmp_path / "a.usda")
@@ -545,8 +543,7 @@ def test_a_folder_that_may_not_be_written_to_is_named(tmp_path, bundle, write):
 
 
 def test_an_export_is_recorded_whole(tmp_path, bundle):
-    """Every file that was written is in the record, with its size, and so is every
-    folder."""
+    """The record has every file that was written, with its size, and every folder."""
     write_site(bundle, tmp_path / "web")
     record = json.loads((tmp_path / "web" / RECORD).read_text())
     found = without(contents(tmp_path / "web"), RECORD)

@@ -1,5 +1,5 @@
-"""`v3dg export`: scenes and bundles as web pages, which browser/test_export_browser.py
-opens in a browser."""
+"""`v3dg export` writes scenes and bundles as web pages; browser/test_export_browser.py
+opens them in a browser."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from v3dg.rotations import rotation_from_quaternion
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """An empty folder, with two bundles, and a scene of three instances with a
+    """An empty folder with two bundles, and a scene of three instances with a
     camera."""
     monkeypatch.chdir(tmp_path)
     for seed in (1, 2):
@@ -44,7 +44,7 @@ def test_a_scene_has_each_bundle_once_with_all_levels(place):
         index = json.loads((place / "deep/er/site" / listed["url"]).read_text())
         assert index["counts"] == listed["counts"]
         counts = [len(bundle.level_gaussians(i)) for i in range(bundle.num_levels)]
-        # Chunks are halved further, down to one gaussian in each.
+        # Chunks are divided further, down to one gaussian each.
         assert index["counts"][: len(counts)] == counts
         assert index["counts"][-1] == json.dumps(index["tree"]).count('"lods"')
     for level, name in ((0, "gaussians"), (-1, "coarsest")):
@@ -76,8 +76,8 @@ def test_a_scene_has_its_instances_and_cameras(place):
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_what_is_up_is_up_in_the_page(place, up):
-    """For a bundle alone, whose files are turned so that y is down, and the page turns
-    them on."""
+    """The files of a single bundle are rotated so that y is down, and the page rotates
+    them further."""
     bundle = v3dg.Bundle.open("a b1.v3dg")
     write_site(bundle, "site", up=up)
     written = v3dg.read_asset("site/lod-meta.json").means @ np.array(
@@ -99,7 +99,7 @@ def test_an_asset_of_one_level_has_coarser_ones_that_begin_somewhere(place):
 
 def test_levels_reach_as_far_as_selection_has_them():
     """Beyond `reach` times the focal length over √tolerance, half of the groups of
-    level 1 are enough."""
+    level 1 suffice."""
     bundle = random_bundle(3, num_levels=5)
     detail = v3dg.export._common.detail_of(bundle)
     first = bundle.groups.level == 1

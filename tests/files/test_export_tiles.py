@@ -1,5 +1,5 @@
-"""3D Tiles of bundles and scenes, and `.glb` files, which
-browser/test_export_browser.py opens in CesiumJS."""
+"""3D Tiles of bundles and scenes, and `.glb` files; browser/test_export_browser.py
+opens them in CesiumJS."""
 
 import json
 import math
@@ -17,7 +17,7 @@ SSE = 16 / math.sqrt(3)
 
 
 def tiles_of(tile, depth=0):
-    """A tile and all below it."""
+    """Return a tile and all tiles below it."""
     yield tile
     for child in tile.get("children", []):
         yield from tiles_of(child)
@@ -36,8 +36,9 @@ def assert_inside(points, tile):
 
 
 def upright(gaussians):
-    """Means of a tile's content, whose y is up, in the tile's frame, whose z is."""
-    in_file = gaussians.means * [-1, -1, 1]  # reading a `.glb` turns them by half a turn about z
+    """Return the means of a tile's content, whose y is up, in the tile's frame, whose z
+    is up."""
+    in_file = gaussians.means * [-1, -1, 1]  # reading a `.glb` rotates them by half a turn about z
     return in_file[:, [0, 2, 1]] * [1, -1, 1]
 
 
@@ -51,8 +52,8 @@ def bundle_tree(folder):
 
 
 def test_any_depth_of_tiles_is_a_level_of_the_bundle(tmp_path, bundle):
-    """Replacing all tiles of a height by their children gives the level below, with
-    nothing lost."""
+    """Replacing all tiles of one height by their children gives the level below, and
+    nothing is lost."""
     write_tiles(bundle, tmp_path / "tiles")
     front = [bundle_tree(tmp_path / "tiles")["root"]]
     if "content" not in front[0]:
@@ -85,7 +86,8 @@ def test_tiles_hold_what_is_below_them(tmp_path, bundle):
 
 
 def test_a_tile_is_replaced_where_selection_would_replace_its_group(tmp_path, bundle):
-    """A screen-space error of 16 px is the tolerance of 3 px² at the same distance."""
+    """A screen-space error of 16 px corresponds to the tolerance of 3 px² at the same
+    distance."""
     write_tiles(bundle, tmp_path / "tiles")
     groups = bundle.groups
     found = {
@@ -94,7 +96,7 @@ def test_a_tile_is_replaced_where_selection_would_replace_its_group(tmp_path, bu
         if tile.get("content", {}).get("uri", "0").split("_")[0] not in ("0", "asset.glb")
     }
     for g, error in found.items():
-        focal, distance = 900.0, 1e4  # so far that a ball's solid angle is its disc's
+        focal, distance = 900.0, 1e4  # so far that the solid angle of a ball is that of a disc
         footprint = math.pi * (groups.ball[g, 3] * focal / distance) ** 2 * groups.weight[g]
         assert (error * focal / distance / 16) ** 2 == pytest.approx(footprint / 3, rel=1e-5)
 
@@ -122,8 +124,8 @@ def test_a_scene_is_a_tile_an_instance(tmp_path):
 
 
 def test_the_page_frames_the_finest_level(tmp_path):
-    """Not the coarse gaussians, which reach far beyond it: at the start nothing would
-    be seen but a speck."""
+    """The coarse gaussians reach far beyond it: if the page framed them, the asset
+    would be tiny in the first view."""
     bundle = random_bundle(3, num_levels=4)
     scene = v3dg.Scene()
     scene.add(bundle, [[5, 0, 0], [0, 9, 1]], [1, 0, 0, 0], [2, 1])

@@ -1,5 +1,5 @@
-"""What all writers do to files and links that are there already; failures are in
-test_malformed."""
+"""The effect of all writers on existing files and links; test_malformed.py tests
+failures."""
 
 import os
 import stat

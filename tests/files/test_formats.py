@@ -28,26 +28,26 @@ from test_ply import random_gaussians
 from v3dg import Gaussians, read_asset, write_asset
 from v3dg.cleaning import AssetWarning
 from v3dg.formats import _reading, compressed_ply
-from v3dg.io import open_asset
+from v3dg.io import open_asset, write_measured
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 SH_C0 = 0.28209479177387814
 
-# The most that a component of a unit quaternion changes by when three are stored with
-# an error e: those by e, the fourth, which is at least a half, by at most 3 * e *
-# sqrt(1/2) / (1/2).
+# If three components of a unit quaternion have the error e, these change by e. The
+# fourth, which is at least a half, changes by at most 3 * e * sqrt(1/2) / (1/2).
 QUAT = 3 * np.sqrt(2)
 
 
 def spz_bounds(sh_bits_1=8, sh_bits_rest=8):
     return {
-        "means": 0.5 * 2**-12,  # 12 bits after the point
-        "log_scales": 0.5 / 16,  # sixteenths
-        "quats": QUAT * 0.5 * np.sqrt(0.5) / 511 * 1.01,  # 9 bits and a sign for up to sqrt(1/2)
+        "means": 0.5 * 2**-12,  # 12 bits after the binary point
+        "log_scales": 0.5 / 16,  # multiples of 1/16
+        # 9 bits and a sign for values up to sqrt(1/2)
+        "quats": QUAT * 0.5 * np.sqrt(0.5) / 511 * 1.01,
         "opacities": 0.5 / 255,
         "color": 0.5 / 255 / 0.15,  # a byte for 1 / 0.15
-        # A byte for -1 to 1 whose lower bits may be dropped, to the nearest or, at its
-        # end, the last below.
+        # A byte for -1 to 1. Its lower bits may be dropped: rounded to the nearest
+        # value or, at the end of the range, to the last one below.
         "band 1": (0.5 * 2.0 ** (8 - sh_bits_1) + 1) / 128,
         "higher": (0.5 * 2.0 ** (8 - sh_bits_rest) + 1) / 128,
     }
@@ -57,7 +57,8 @@ def compressed_ply_bounds(reference):
     extent = np.ptp(reference.means, axis=0).max()
     color = np.ptp(reference.sh[:, 0], axis=0).max()
     return {
-        "means": extent * 0.5 / 1023,  # 10 bits of y, 11 of x and z, of the extent of a chunk
+        # 10 bits for y and 11 for x and z, over the extent of a chunk
+        "means": extent * 0.5 / 1023,
         "log_scales": np.ptp(np.log(reference.scales)) * 0.5 / 1023,
         "quats": QUAT * np.sqrt(2) * 0.5 / 1023 * 1.01,  # 10 bits for -sqrt(1/2) to sqrt(1/2)
         "opacities": 0.5 / 255,
@@ -69,18 +70,18 @@ def compressed_ply_bounds(reference):
 
 def sog_bounds(reference):
     logs = np.log1p(np.abs(reference.means))
-    # Of 256 values that are nearer to each other where there is more: none is further
-    # from its value than two steps of equal length.
+    # The 256 values are closer to each other where there are more values. No error
+    # exceeds two steps of equal length.
     step = 2 / 256
     return {
-        # 16 bits, cut off, of sign(x) ln(1 + |x|), whose derivative is at least 1 / (1
-        # + |x|).
+        # 16 bits, truncated, of sign(x) ln(1 + |x|), whose derivative is at least 1 /
+        # (1 + |x|).
         "means": np.ptp(np.sign(reference.means) * logs, axis=0).max()
         / 65535
         * (1 + np.abs(reference.means).max()),
         "log_scales": np.ptp(np.log(reference.scales)) * step,
-        "quats": QUAT * np.sqrt(2) / 255 * 1.02,  # a byte, cut off, for -sqrt(1/2) to sqrt(1/2)
-        "opacities": 1.001 / 255,  # cut off
+        "quats": QUAT * np.sqrt(2) / 255 * 1.02,  # a byte, truncated, for -sqrt(1/2) to sqrt(1/2)
+        "opacities": 1.001 / 255,  # truncated
         "color": np.ptp(reference.sh[:, 0]) * step,
         "band 1": np.ptp(reference.sh[:, 1:]) * step if reference.sh_degree else 0,
         "higher": np.ptp(reference.sh[:, 1:]) * step if reference.sh_degree else 0,
@@ -89,14 +90,14 @@ def sog_bounds(reference):
 
 SPLAT_BOUNDS = {
     "means": 0,
-    "log_scales": 1e-6,  # the writer's float32 exp
-    "quats": QUAT / 128,  # a byte, cut off, for -1 to 1
-    "opacities": 1.001 / 255,  # cut off
-    "color": 1.001 / 255 / SH_C0,  # cut off, of what is within black and white
+    "log_scales": 1e-6,  # the writer computes exp in float32
+    "quats": QUAT / 128,  # a byte, truncated, for -1 to 1
+    "opacities": 1.001 / 255,  # truncated
+    "color": 1.001 / 255 / SH_C0,  # truncated, of colours between black and white
 }
 
 KSPLAT_HALF = {
-    "means": 2.5 / 32767 * 0.51,  # 16 bits for a bucket of side 5
+    "means": 2.5 / 32767 * 0.51,  # 16 bits for a bucket with side 5
     "log_scales": 2**-10,  # half precision
     "quats": 2**-11,
     "opacities": SPLAT_BOUNDS["opacities"],
@@ -105,7 +106,7 @@ KSPLAT_HALF = {
     "higher": 0.4 * 2**-10,
 }
 
-# Formats that we write; SOG's bytes are rounded to the nearest then.
+# Formats that v3dg writes. Bytes of SOG are then rounded to the nearest.
 WRITTEN = {
     ".compressed.ply": compressed_ply_bounds,
     ".spz": lambda _: spz_bounds(),
@@ -115,8 +116,8 @@ WRITTEN = {
     ".glb": lambda _: {},
 }
 
-# File, the asset that it was made of, its bounds; who wrote it is in
-# fixtures/README.md.
+# A file, the asset from which it was made, and its bounds; fixtures/README.md names the
+# writers.
 FOREIGN = {
     "sh0.compressed.ply": compressed_ply_bounds,
     "sh3.compressed.ply": compressed_ply_bounds,
@@ -146,7 +147,8 @@ def reference_of(name):
 
 
 def in_order_of(reference, gaussians):
-    """The gaussians, each at the place of the reference's that is nearest to it."""
+    """Return for each gaussian of the reference the nearest gaussian, in the order of
+    the reference."""
     squared = np.square(reference.means[:, None].astype(float) - gaussians.means).sum(axis=2)
     nearest = squared.argmin(axis=1)
     assert len(set(nearest)) == len(reference) == len(gaussians)
@@ -178,15 +180,15 @@ def largest_errors(gaussians, reference):
 def assert_within(gaussians, reference, bounds):
     assert gaussians.sh_degree == reference.sh_degree
     for name, error in largest_errors(gaussians, reference).items():
-        # Besides, float32's own rounding of values of up to 8.
+        # To this is added the rounding of float32 for values up to 8.
         assert error <= bounds.get(name, 0) + 1e-6, name
 
 
 @pytest.mark.parametrize("name", FOREIGN)
 def test_what_other_tools_write_is_read(name):
     reference = reference_of(name)
-    # The library of the format turns a `.ply`; the other programs do not, and record no
-    # axes.
+    # The library of the format rotates a `.ply` asset. The other programs do not, and
+    # record no axes.
     if name.endswith(".spz") and "adobe" not in name:
         reference = half_turn(reference, "x")
     gaussians = in_order_of(reference, read_asset(FIXTURES / name))
@@ -211,7 +213,7 @@ def test_what_is_written_reads_back(tmp_path, suffix, degree):
     write_asset(path, reference)
     assert_within(in_order_of(reference, read_asset(path)), reference, WRITTEN[suffix](reference))
     numbers = 4 * (11 + 3 * sh.shape[1]) if suffix == ".glb" else 20 + 3 * sh.shape[1]
-    assert path.stat().st_size < 64 * numbers + 17_000  # SOG's tables
+    assert path.stat().st_size < 64 * numbers + 17_000  # tables of SOG
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -232,10 +234,53 @@ def test_gsply_reads_version_2_of_spz(tmp_path):
     reference = read_asset(FIXTURES / "sh3.ply")
     write_asset(tmp_path / "a.spz", reference, version=2)
     theirs = gsply.read_spz(str(tmp_path / "a.spz"))
-    reference = half_turn(reference, "x")  # which gsply does not turn back
+    reference = half_turn(reference, "x")  # gsply does not rotate this back
     np.testing.assert_allclose(theirs.means, reference.means, atol=2**-12)
     dot = np.abs((unit(theirs.quats) * unit(reference.quats)).sum(axis=1))
-    assert dot.min() > 1 - 0.1**2 / 2  # the bound that quaternions of version 2 have
+    assert dot.min() > 1 - 0.1**2 / 2  # the bound for quaternions of version 2
+
+
+def test_degree_4_of_spz_is_read_up_to_degree_3(tmp_path):
+    """The library of the format knows degree 4: 24 coefficients after the first."""
+    content = bytearray(gzip.decompress((FIXTURES / "sh3_v3.spz").read_bytes()))
+    count = int.from_bytes(content[8:12], "little")
+    content[12] = 4
+    first = 16 + 20 * count
+    lower = np.frombuffer(content, "u1", 45 * count, first).reshape(count, 45)
+    higher = np.full((count, 27), 200, "u1")
+    whole = bytes(content[:first]) + np.hstack([lower, higher]).tobytes()
+    (tmp_path / "a.spz").write_bytes(gzip.compress(whole))
+    with pytest.warns(AssetWarning, match="above SH degree 3 were ignored"):
+        found = read_asset(tmp_path / "a.spz")
+    wanted = read_asset(FIXTURES / "sh3_v3.spz")
+    for name, values in vars(wanted).items():
+        np.testing.assert_array_equal(getattr(found, name), values, err_msg=name)
+
+
+def test_rotations_of_spz_version_2_are_as_close_as_their_bytes_allow(tmp_path):
+    """A search of all bytes within 3 of the components, 343 for each of 65,536 random
+    rotations, leaves 6.4 degrees at most and 0.70 on average; rounding leaves 11.7 and
+    1.1. What the command says is measured from the file."""
+    rng = np.random.default_rng(0)
+    quats = rng.normal(size=(5000, 4))
+    asset = Gaussians(
+        rng.normal(size=(5000, 3)).astype(np.float32),
+        (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        np.full((5000, 3), 0.1, np.float32),
+        np.full(5000, 0.5, np.float32),
+        np.zeros((5000, 1, 3), np.float32),
+    )
+    losses = write_measured(tmp_path / "a.spz", asset, version=2)
+    found = read_asset(tmp_path / "a.spz")
+    cosines = np.abs((unit(found.quats) * unit(asset.quats)).sum(axis=1))
+    degrees = np.degrees(2 * np.arccos(np.minimum(1, cosines)))
+    assert degrees.max() < 6.6
+    assert degrees.mean() < 0.76
+    assert losses.rotation_error == pytest.approx(degrees.max(), rel=1e-3)
+    assert f"rotations {degrees.max():.2g}°" in losses.lines[-1]
+    # From another axis, rotations are read with half turns about their own axes.
+    newer = write_measured(tmp_path / "b.spz", asset, up="z")
+    assert newer.rotation_error < 0.25
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -246,7 +291,7 @@ def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
     write_asset(path, reference)
     if suffix == ".spz":
         theirs = gsply.read_spz(str(path))
-        reference = half_turn(reference, "x")  # which gsply does not turn back
+        reference = half_turn(reference, "x")  # gsply does not rotate this back
     else:
         theirs = gsply.plyread(str(path))
     num = len(reference)
@@ -266,7 +311,7 @@ def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
         **{name: np.ascontiguousarray(array, np.float32) for name, array in values.items()}
     )
     bounds = WRITTEN[suffix](reference)
-    # It moves opacities of 0 and 1 by 1e-6.
+    # It changes opacities of 0 and 1 by 1e-6.
     assert_within(
         in_order_of(reference, found), reference, bounds | {"opacities": bounds["opacities"] + 1e-6}
     )
@@ -359,8 +404,8 @@ def test_a_compressed_ply_is_told_by_its_content(tmp_path):
 
 @pytest.mark.parametrize("num_far", [0, 1, 300, 3000])
 def test_a_far_background_costs_a_compressed_ply_nothing(tmp_path, num_far):
-    """A chunk, whose range has 1,024 or 2,048 steps, does not mix near and far
-    gaussians, except for less than 256 of the least visible."""
+    """A chunk's range has 1,024 or 2,048 steps, so a chunk does not mix near and far
+    gaussians, except for fewer than 256 of the least visible ones."""
     near = random_gaussians(3000, 1)
     near.means[:] = np.random.default_rng(1).uniform(-1, 1, near.means.shape)
     far = random_gaussians(num_far, 1)
@@ -386,7 +431,8 @@ def test_a_far_background_costs_a_compressed_ply_nothing(tmp_path, num_far):
 
 
 def errors_of_positions(folder, asset):
-    """Distances (N,) of positions in a compressed .ply from those of the asset."""
+    """Return the distances (N,) between positions in a compressed .ply file and those
+    of the asset."""
     write_asset(folder / "a.compressed.ply", asset)
     found = read_asset(folder / "a.compressed.ply")
     order = compressed_ply.chunk_order(asset)
@@ -394,12 +440,13 @@ def errors_of_positions(folder, asset):
 
 
 def test_chunks_of_a_wide_flat_scene_are_small(tmp_path):
-    """Each is about as wide as it is long, and none cuts the thin axis."""
+    """Each chunk is about as wide as it is long, and no split halves the thin axis."""
     asset = random_gaussians(20_000, 0)
     rng = np.random.default_rng(1)
     asset.means[:] = rng.uniform(0, 1, asset.means.shape) * (1000, 2, 600)
     errors = errors_of_positions(tmp_path, asset)
-    # The side of a chunk of 256, over twice the 2,047 steps of x and z, in both.
+    # The side of a chunk of 256 gaussians, divided by twice the 2,047 steps, in x and
+    # in z.
     expected = np.sqrt(256 / 20_000 * 1000 * 600) / 2 / 2047
     assert np.quantile(errors, 0.98) < 2 * expected
 
@@ -415,7 +462,7 @@ def test_a_stray_gaussian_costs_no_more_than_a_chunk(tmp_path):
 
 
 def test_the_innermost_of_the_next_shell_fill_a_chunk(tmp_path):
-    """So that its range is no wider than it needs to be."""
+    """The range of the chunk is then no wider than necessary."""
     near = random_gaussians(3000, 0)
     near.means[:] = np.random.default_rng(1).uniform(-1, 1, near.means.shape)
     far = random_gaussians(400, 0)
@@ -436,7 +483,7 @@ def test_equal_positions_are_written(tmp_path, count):
 
 
 def test_chunks_without_colours_mean_black_to_white(tmp_path):
-    """Files from before the ranges of colour were added."""
+    """Such files were written before the ranges of colours were added."""
     content = (FIXTURES / "sh0.compressed.ply").read_bytes()
     head, body = content.split(b"end_header\n", 1)
     lines = [
@@ -453,7 +500,7 @@ def test_chunks_without_colours_mean_black_to_white(tmp_path):
 
 
 def spz_of_version(version, asset, fraction_bits=12):
-    """Bytes of a file of a version that no tool writes any more, from Niantic's
+    """Return a file of a version that no tool writes any more, by Niantic's
     description."""
     num = len(asset)
     positions = (
@@ -484,7 +531,7 @@ def spz_of_version(version, asset, fraction_bits=12):
 def test_old_versions_of_spz_are_read(tmp_path, version):
     reference = read_asset(FIXTURES / "sh3.ply")
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz_of_version(version, reference)))
-    # Where w is nearly 0, it has the square root of x y z's errors.
+    # If w is nearly 0, its error is the square root of the errors of x, y and z.
     bounds = spz_bounds() | {"quats": 0.1}
     if version == 1:
         bounds["means"] = np.abs(reference.means).max() * 2**-11  # half precision
@@ -509,7 +556,7 @@ HOSTILE_SPZ = {
     "version": (spz(version=5), "expected .spz of version 1 to 4, got 5"),
     "version 0": (spz(version=0), "expected .spz of version 1 to 4, got 0"),
     "version 4 in gzip": (spz(version=4), "expected version 1 to 3 in gzip, got 4"),
-    "degree": (spz(degree=4), "expected SH degree 0 to 3, got 4"),
+    "degree": (spz(degree=5), "expected SH degree 0 to 4, got 5"),
     "fraction bits": (spz(bits=25), "expected at most 24 fraction bits, got 25"),
     "too short": (
         spz()[:-1],
@@ -539,7 +586,8 @@ def test_hostile_spz_is_refused(tmp_path, case):
 
 
 def assert_refused_cheaply(path, message):
-    with pytest.raises(ValueError, match=f"^{path}: "):  # what is imported late is imported here
+    # Modules that are imported late are imported here.
+    with pytest.raises(ValueError, match=f"^{path}: "):
         read_asset(path)
     tracemalloc.start()
     try:
@@ -586,8 +634,8 @@ def test_hostile_spz_of_version_4_is_refused(tmp_path, place, value, message):
 
 
 def sog_with(tmp_path, edit=None, files=None, compression=zipfile.ZIP_STORED):
-    """The fixture with `edit` of the text of its meta.json, and other contents of some
-    files."""
+    """Return the fixture with `edit` applied to the text of its meta.json, and with
+    other contents of some files."""
     path = tmp_path / "a.sog"
     with (
         zipfile.ZipFile(FIXTURES / "sh0.sog") as source,
@@ -690,7 +738,7 @@ def test_other_pictures_are_refused(tmp_path):
 
 
 def test_a_first_value_that_is_null_continues_its_codebook(tmp_path):
-    """As some versions of splat-transform wrote it."""
+    """Some versions of splat-transform wrote it like this."""
     import json
     import re
 
@@ -799,8 +847,8 @@ def test_hostile_compressed_ply_is_refused(tmp_path, case):
 
 
 def test_glb_of_splat_transform_has_the_numbers_of_its_ply():
-    """It turns assets to the axes of glTF, by half a turn about z, and their own axes
-    with them."""
+    """It rotates assets to the axes of glTF by half a turn about z, and also the
+    gaussians' own axes."""
     reference = read_asset(FIXTURES / "sh3.ply")
     own_axes_turned = np.ascontiguousarray(reference.quats[:, [3, 2, 1, 0]]) * np.float32(
         [-1, 1, -1, 1]
@@ -812,7 +860,7 @@ def test_glb_of_splat_transform_has_the_numbers_of_its_ply():
 
 
 def test_a_glb_says_that_its_views_are_of_vertices(tmp_path):
-    """glTF-Validator asks for it."""
+    """glTF-Validator requires it."""
     write_asset(tmp_path / "a.glb", read_asset(FIXTURES / "sh3.ply"))
     content = (tmp_path / "a.glb").read_bytes()
     document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
@@ -820,7 +868,7 @@ def test_a_glb_says_that_its_views_are_of_vertices(tmp_path):
 
 
 def glb(change):
-    """The fixture with its JSON changed by a function, or its bytes by another."""
+    """Return the fixture after a function changed its JSON, or another its bytes."""
     content = (FIXTURES / "sh3.glb").read_bytes()
     size = int.from_bytes(content[12:16], "little")
     document = json.loads(content[20 : 20 + size])
@@ -902,8 +950,8 @@ def test_a_glb_that_is_cut_off_is_refused(tmp_path):
 
 
 def hier_of(asset, half, inner=7):
-    """Bytes of a `.hier`, as its program's writer has them: some inner gaussians, then
-    leaves, two a node."""
+    """Return a `.hier` file as its program writes it: some inner gaussians, then
+    leaves, two per node."""
     kind, count = ("<f2" if half else "<f4"), inner + len(asset)
 
     def column(values, of=kind):
@@ -917,7 +965,7 @@ def hier_of(asset, half, inner=7):
         column(asset.opacities),
         column(asset.sh.reshape(len(asset), 48)),
     ]
-    # Where gaussians begin, how many are leaves, how many merged.
+    # The first gaussian, the number of leaves, and the number of merged gaussians.
     nodes = [(i, 0, 1) for i in range(inner)]
     nodes += [(inner + i, min(2, len(asset) - i), 0) for i in range(0, len(asset), 2)]
     if half:
@@ -966,7 +1014,7 @@ def test_hostile_hier_is_refused(tmp_path, case):
 
 
 @settings(max_examples=300)
-# A file name in a zip that is no UTF-8.
+# This file name in a zip is not UTF-8.
 @example(name="sh3.sog", edits=[(230, 128)], in_header=True)
 @pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")
 @given(
@@ -1001,13 +1049,13 @@ def test_changed_bytes_never_do_worse_than_an_error(tmp_path_factory, name, edit
 
 
 def read_quietly(path):
-    """All gaussians, without what reading them may warn of."""
+    """Return all gaussians, without warnings."""
     file = open_asset(path)
     return file.read(0, file.num_gaussians)
 
 
 def gsplat_tensors(asset):
-    """What gsplat's trainer calls the parameters of an asset."""
+    """Return the tensors of an asset under the names of gsplat's trainer."""
     tensors = asset.torch()
     return {
         "means": tensors.means,
@@ -1022,7 +1070,8 @@ def gsplat_tensors(asset):
 def assert_same(gaussians, asset):
     for name in ("means", "sh"):
         np.testing.assert_array_equal(getattr(gaussians, name), getattr(asset, name))
-    np.testing.assert_allclose(gaussians.scales, asset.scales, rtol=8e-7)  # of the log in float32
+    # The bound is that of the logarithm in float32.
+    np.testing.assert_allclose(gaussians.scales, asset.scales, rtol=8e-7)
     np.testing.assert_allclose(gaussians.opacities, asset.opacities, atol=1e-6)
     np.testing.assert_allclose(gaussians.quats, unit(asset.quats), atol=2e-7)
 
@@ -1054,7 +1103,7 @@ def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
         "scalers": {},
     }
     asset = replace(asset, means=tensors["means"].numpy())
-    if degree == 0:  # splatfacto then has logits of colours, see `shs_0` of its model
+    if degree == 0:  # the model of splatfacto then stores logits of colours, see its `shs_0`
         colors = 1 / (1 + np.exp(-asset.sh.astype(np.float64)))
         asset = replace(asset, sh=((colors - 0.5) / SH_C0).astype(np.float32))
     torch.save(content, tmp_path / "step-000029999.ckpt")
@@ -1100,7 +1149,7 @@ def test_colours_of_a_gsplat_with_appearance_are_those_without_it(tmp_path):
 
 
 class Captured(torch.nn.Module):
-    """What the code of the 3DGS paper captures; 2DGS stores two scales."""
+    """What the code of the 3DGS paper saves; 2DGS stores two scales."""
 
     def __init__(self, asset, num_scales):
         super().__init__()
@@ -1232,8 +1281,8 @@ def test_checkpoints_that_do_not_fit_are_refused(tmp_path, change, message):
 
 
 def test_changed_bytes_of_a_checkpoint_never_do_worse_than_an_error(tmp_path):
-    """Where the zip says what it holds: what torch makes of that has no list of
-    errors."""
+    """Only bytes of the zip's tables are changed, because torch may raise any error for
+    the rest."""
     torch.save({"splats": gsplat_tensors(random_gaussians(2, 0))}, tmp_path / "whole.pt")
     content = (tmp_path / "whole.pt").read_bytes()
     path = tmp_path / "a.pt"
@@ -1339,8 +1388,8 @@ def test_a_checkpoint_whose_numbers_are_others_is_refused(saved, change):
 
 @pytest.mark.parametrize("suffix", [".pt", ".sog"])
 def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path, monkeypatch, suffix):
-    """Of these the parts are read one by one; nothing is mapped, which would end the
-    process."""
+    """The parts of these formats are read one by one. None is mapped, because that
+    would end the process."""
     path, asset = tmp_path / f"a{suffix}", random_gaussians(5000, 0)
     if suffix == ".sog":
         write_asset(path, asset)
@@ -1387,7 +1436,8 @@ def test_half_of_the_ranges_of_colour_is_refused(tmp_path, gone):
 
 
 def test_small_sog_keeps_the_harmonics_of_every_gaussian(tmp_path):
-    """Palettes of a quarter of the gaussians lost 5 to 30 dB of small assets."""
+    """Palettes with a quarter as many entries as gaussians lost 5 to 30 dB for small
+    assets."""
     rng = np.random.default_rng(0)
     gaussians = random_gaussians(4000, 3)
     sh = gaussians.sh.copy()
@@ -1398,5 +1448,5 @@ def test_small_sog_keeps_the_harmonics_of_every_gaussian(tmp_path):
     order = np.argsort(back.means @ (1.0, 1e3, 1e6))
     expected = sh[np.argsort(asset.means @ (1.0, 1e3, 1e6)), 1:]
     errors = back.sh[order, 1:] - expected
-    # A few neighbours change places in the rounding of their means.
+    # Rounding of the means exchanges the places of a few neighbours.
     assert np.median(np.abs(errors)) < 2e-3

@@ -1,5 +1,5 @@
-"""glTF: where nodes put gaussians, and every way in which the specification stores
-numbers.
+"""glTF: where nodes place gaussians, and every form in which the specification stores
+numbers. Values are compared in the axes of the file, before the reader rotates them.
 
 Values are compared in the axes of the file, before the reader turns them.
 """
@@ -31,7 +31,7 @@ SIN = float(np.sin(0.4))
 
 
 def read(path):
-    """The gaussians as the file has them, with the axes of glTF."""
+    """Return the gaussians in the axes of glTF, as they are in the file."""
     return Scene(Document(path)).read()
 
 
@@ -61,12 +61,12 @@ def padded(gaussians, degree):
 
 
 def about(axis, angle):
-    """A quaternion x y z w, as glTF has it."""
+    """Return a quaternion x y z w, in the order of glTF."""
     return [*(np.sin(angle / 2) * np.eye(3)["xyz".index(axis)]), np.cos(angle / 2)]
 
 
 def matrix_of(quaternion=(0, 0, 0, 1), translation=(0, 0, 0), scale=(1, 1, 1)):
-    """The columns of a matrix, one after another."""
+    """Return the columns of a matrix one after the other."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_from_quaternion(np.roll(quaternion, 1)) * scale
     matrix[:3, 3] = translation
@@ -124,7 +124,7 @@ def test_transforms_of_parents_come_after_those_of_children(tmp_path):
 
 
 def test_a_mesh_is_read_wherever_it_is_used(tmp_path):
-    """With all of its primitives, which may have different degrees."""
+    """All primitives of a mesh are read; they may have different degrees."""
     flat = with_sh(OTHER, np.ascontiguousarray(OTHER.sh[:, :1]))
     file = GltfFile()
     mesh = file.mesh(ASSET, flat)
@@ -143,8 +143,8 @@ def test_a_mesh_is_read_wherever_it_is_used(tmp_path):
 
 
 def test_scales_along_axes_stretch_gaussians(tmp_path):
-    """As the extension defines it: the covariance is that of the matrix, and colours
-    are turned by its rotation alone."""
+    """The extension defines it like this: the covariance is transformed by the matrix,
+    and colours are rotated by its rotation only."""
     factors = np.array([0.5, 2.0, 3.0])
     file = GltfFile()
     file.nodes(
@@ -272,7 +272,8 @@ def test_without_scenes_all_nodes_are_read_and_without_nodes_all_meshes(tmp_path
 
 
 def quantised(values, kind, is_normalised):
-    """Values of 0 to 1, or -1 to 1, as whole numbers; and what these stand for."""
+    """Return values from 0 to 1, or -1 to 1, as integers, and the values that these
+    encode."""
     most = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}[kind]
     numbers = np.rint(np.asarray(values) * most)
     if is_normalised:
@@ -324,7 +325,8 @@ def test_the_lowest_whole_number_is_minus_one(tmp_path):
 
 
 def sparse(file, rows, places, values, kind=5123, **fields):
-    """The number of an accessor of zeros, or of a view, with some values replaced."""
+    """Return the index of an accessor of zeros or of a view, with some values
+    replaced."""
     numbers = np.asarray(places).astype({5121: "u1", 5123: "<u2", 5125: "<u4"}[kind])
     part = {
         "count": len(places),
@@ -400,7 +402,7 @@ def test_wrong_sparse_accessors_are_refused(tmp_path, case):
 
 
 def test_values_that_are_interleaved_are_read(tmp_path):
-    """Several attributes in one view, each with its offset."""
+    """A view contains several attributes, each with its offset."""
     file = GltfFile()
     attributes = file.attributes(ASSET)
     rows = np.concatenate([ASSET.means, ASSET.scales, np.zeros((20, 2))], axis=1).astype("<f4")
@@ -479,7 +481,7 @@ def test_a_document_may_have_its_buffers_inside(tmp_path):
 
 
 def test_a_glb_may_have_several_buffers(tmp_path):
-    """The first is its own chunk; others are files or data."""
+    """The first one is its own chunk; the others are files or data URIs."""
     file = GltfFile()
     attributes = file.attributes(ASSET)
     view = file.document["bufferViews"][file.document["accessors"][0]["bufferView"]]
@@ -524,7 +526,7 @@ def test_bytes_that_another_extension_packs_are_refused(tmp_path):
     file.document["buffers"].append({"byteLength": 99, "extensions": {name: {"fallback": True}}})
     view = file.document["bufferViews"][0]
     view["extensions"] = {name: {"buffer": 0, "byteLength": view["byteLength"]}}
-    assert_same(read(file.write(path)), ASSET)  # the fallback is there
+    assert_same(read(file.write(path)), ASSET)  # the fallback exists
     view["buffer"] = 1
     file.write(path)
     with pytest.raises(ValueError, match=f"bufferViews.0.: expected uncompressed data, got {name}"):
@@ -533,7 +535,7 @@ def test_bytes_that_another_extension_packs_are_refused(tmp_path):
 
 @pytest.mark.parametrize("place", ["primitive", "extension"])
 def test_numbers_that_another_extension_has_are_refused(tmp_path, place):
-    """Their accessors have no view, which would otherwise be zeros."""
+    """Their accessors have no view, and would be read as zeros."""
     file = GltfFile()
     attributes = file.attributes(ASSET)
     primitive = file.primitive(attributes)
@@ -576,7 +578,7 @@ def test_what_is_declared_and_not_done_is_told(tmp_path):
 
 
 def test_linear_colours_are_converted(tmp_path):
-    """What a gaussian shows from any side is encoded as a picture is."""
+    """Colours from all directions are encoded like those of a picture."""
     rng = np.random.default_rng(3)
     sh = rng.normal(0, 0.05, ASSET.sh.shape).astype(np.float32)
     sh[:, 0] = rng.uniform(-0.5, 1.5, (20, 3))
@@ -593,7 +595,7 @@ def test_linear_colours_are_converted(tmp_path):
     colors = np.einsum("dk,nkc->ndc", bases, read(path).sh) + 0.5
     assert np.abs(colors - wanted).mean() < 0.002
     assert np.abs(colors - wanted).max() < 0.1
-    assert np.abs(light - wanted).mean() > 0.1  # else the test would show nothing
+    assert np.abs(light - wanted).mean() > 0.1  # otherwise the test would show nothing
     assert "converted to sRGB" in notes_of(path)[0]
 
 
@@ -609,7 +611,7 @@ def test_names_of_drafts_are_read(tmp_path):
 
 @pytest.mark.parametrize("kind", [5121, FLOAT])
 def test_colours_of_drafts_are_read(tmp_path, kind):
-    """They have colour and opacity as COLOR_0."""
+    """They store colour and opacity as COLOR_0."""
     rng = np.random.default_rng(4)
     rgba = np.rint(rng.uniform(0, 255, (20, 4)))
     file = GltfFile()
@@ -634,7 +636,8 @@ def test_colours_of_drafts_are_read(tmp_path, kind):
 
 
 def packed(file, asset, name):
-    """A primitive whose gaussians are a `.spz`, by the name of the extension."""
+    """Return a primitive whose gaussians are a `.spz`, with the name of the
+    extension."""
     content = b"".join(spz.encode(asset, 2))
     attributes = {"POSITION": file.bare_accessor(asset.means)}
     extension = {"bufferView": file.view(content)}
@@ -676,8 +679,9 @@ def test_spz_in_a_primitive_is_read(tmp_path, name):
 @pytest.mark.parametrize("axes", ["", "RUB", "LUF", "RDF", "RBU"])
 @pytest.mark.parametrize("released", [True, False])
 def test_the_axes_of_a_spz_in_a_primitive(tmp_path, axes, released):
-    """Those that it records, or else those of .spz, if the primitive has the properties
-    that the release of the extension requires; drafts have those of glTF."""
+    """The axes that it records are used. Otherwise they are those of .spz if the
+    primitive has the properties that the released extension requires, and those of glTF
+    in drafts."""
     content = b"".join(spz.encode(ASSET, 3, axes=axes))
     stored = spz.decode(tmp_path, b"".join(spz.encode(ASSET, 3)), claims_of(tmp_path), "LUF", "LUF")
     file = GltfFile()
@@ -764,7 +768,7 @@ def test_chunks_of_others_are_passed_over(tmp_path):
 
 
 def test_nodes_may_be_nested_deep(tmp_path):
-    """Far deeper than Python's stack; the time is that of one pass."""
+    """They are nested far deeper than Python's stack. The time is that of one pass."""
     file = GltfFile()
     mesh = file.mesh(ASSET)
     count = 30_000
@@ -776,7 +780,8 @@ def test_nodes_may_be_nested_deep(tmp_path):
 
 
 def test_a_mesh_that_is_used_too_often_is_refused(tmp_path):
-    """Gaussians are as many as nodes place, which the size of the file bounds."""
+    """The number of gaussians is the number that nodes place. The size of the file
+    bounds it."""
     file = GltfFile()
     mesh = file.mesh(random_gaussians(np.random.default_rng(0), 100))
     file.nodes(*[{"mesh": mesh}] * 20_000, roots=range(20_000))

@@ -1,5 +1,5 @@
-"""What all readers and writers of files have in common: whatever lies there, an error
-says what and where.
+"""Common properties of all readers and writers: for any damage, an error tells what is
+wrong and where. The tests of a format have the damage that only this format can have.
 
 Damage that only one format can have is in the tests of that format.
 """
@@ -41,7 +41,8 @@ def read_scene(path):
 
 
 def read_asset(path):
-    """All at once; in parts it is the same gaussians or an error just as good."""
+    """Return all gaussians. Reading them in parts gives the same gaussians, or also an
+    error that tells what is wrong."""
 
     def read_in_parts(path):
         file = open_asset(path)
@@ -89,7 +90,7 @@ def checkpoint(path):
     return path.read_bytes()
 
 
-# Name of a file, what is in a good one, and how it is read.
+# The name of a file, the content of a valid one, and the function that reads it.
 READERS = {
     "ply": (
         "a.ply",
@@ -119,7 +120,8 @@ READERS = {
 
 
 def assert_refused(read, path):
-    """It raises what a person can act on: one line that names the file."""
+    """Assert that it raises an error that a user can act on: one line that names the
+    file."""
     with pytest.raises((ValueError, OSError)) as error:
         read(path)
     text = str(error.value)
@@ -129,7 +131,7 @@ def assert_refused(read, path):
 
 @pytest.mark.parametrize("reader", READERS)
 def test_good_files_are_read(tmp_path, reader):
-    """Else nothing below would mean anything."""
+    """Otherwise the tests below would show nothing."""
     name, content, read = READERS[reader]
     (tmp_path / name).write_bytes(content(tmp_path))
     read(tmp_path / name)
@@ -170,7 +172,7 @@ CONTENTS = {
 
 @pytest.mark.parametrize("reader", READERS)
 def test_only_text_may_have_a_byte_order_mark(tmp_path, reader):
-    """Programs of Windows write one before JSON."""
+    """Programs on Windows write such a mark before JSON."""
     name, content, read = READERS[reader]
     (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + content(tmp_path))
     if name.endswith((".json", ".gltf")):
@@ -234,7 +236,7 @@ def test_impossible_names_are_refused(tmp_path, reader):
 
 @contextlib.contextmanager
 def without_privileges():
-    """As a user whom file permissions mean something to."""
+    """Run as a user whom file permissions restrict."""
     is_root = os.geteuid() == 0
     if is_root:
         os.seteuid(65534)
@@ -246,8 +248,8 @@ def without_privileges():
 
 
 def let_others_look(folder):
-    """Open a temporary folder to every user, with those above it that pytest made for
-    its own user alone: there is one more in a process of pytest-xdist."""
+    """Open a temporary folder to every user, with the folders above it that pytest
+    created for its own user. A process of pytest-xdist has one more of these."""
     folders = [folder, *folder.parents]
     names = [path.name.startswith("pytest-of-") for path in folders]
     top = names.index(True) if any(names) else 2
@@ -269,10 +271,10 @@ def test_unreadable_files_are_named(tmp_path, reader):
 def test_every_truncation_is_refused(tmp_path, reader):
     name, content, read = READERS[reader]
     good = content(tmp_path)
-    # The last number of a text is still a number when its last digits are gone.
+    # If the last digits of a text are missing, its last number is still a number.
     last = good.rfind(b" ") + 1 if reader == "ply" else len(good)
-    # Every offset of a bundle is in its own tests, and of the others most bytes are not
-    # looked at.
+    # The tests of bundles truncate at every offset. Readers of the other formats ignore
+    # most bytes.
     step = {"bundle": 37, "sog": 37, "ksplat": 37, "checkpoint": 37, "gltf": 37}.get(reader, 1)
     for size in range(0, last, step):
         (tmp_path / name).write_bytes(good[:size])
@@ -416,7 +418,7 @@ def test_claims_of_a_header_cost_no_memory(tmp_path, claim):
     path = tmp_path / name
     path.write_bytes(content)
     read = v3dg.read_asset if name.endswith(".ply") else read_bundle
-    assert_refused(read, path)  # what is imported late is imported here
+    assert_refused(read, path)  # modules that are imported late are imported here
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     tracemalloc.start()
     try:
@@ -429,7 +431,7 @@ def test_claims_of_a_header_cost_no_memory(tmp_path, claim):
 
 
 def test_nothing_that_is_read_can_be_executed():
-    """No module knows a way to run what is in a file."""
+    """No module that reads files has a function that executes content."""
     forbidden = {"pickle", "marshal", "shelve", "eval", "exec", "compile", "__import__", "yaml"}
     for path in Path(v3dg.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -512,7 +514,7 @@ def test_a_full_disk_is_named_and_leaves_what_was_there(tmp_path, writer, num_by
 
 
 def test_enough_is_tried():
-    """Two hundred broken inputs at the least, not counting changed bytes and
+    """There are at least two hundred broken inputs, not counting changed bytes and
     truncations."""
     here = len(READERS) * (len(CONTENTS) + len(PLACES) + 4) + 2 * len(JSON_TEXTS) + len(CLAIMS)
     assert here + len(HOSTILE) > 200

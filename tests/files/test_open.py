@@ -1,5 +1,5 @@
-"""Files in place of what is in them: `v3dg.open`, and functions that are given a file's
-name instead of a bundle, a scene or an asset."""
+"""Files instead of their content: `v3dg.open`, and functions that accept the name of a
+file instead of a bundle, a scene or an asset."""
 
 import json
 

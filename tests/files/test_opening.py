@@ -1,5 +1,5 @@
-"""Opening bundles: tables are read and hashed while they are looked at, and several
-files at once."""
+"""Opening bundles: tables are read and hashed while they are checked, and several files
+are opened at once."""
 
 import os
 
@@ -11,7 +11,7 @@ from support.file_hash import PIECE, file_hash
 from support.random_bundle import random_bundle
 from v3dg import Bundle, Clusters, Gaussians, Groups, _core
 
-LARGE = 5 << 20  # bytes: what is read and hashed on threads of its own
+LARGE = 5 << 20  # bytes from which tables are read and hashed on separate threads
 
 
 SIZES = [0, 1, 127, 128, 129, 256, 4097, PIECE - 200, PIECE, PIECE + 1, 10 * PIECE]
@@ -80,7 +80,7 @@ def test_what_the_system_cannot_read_is_an_error_with_the_name(tmp_path, size):
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory):
-    """A file whose tables are large: many clusters of one gaussian, of one level."""
+    """A file with large tables: one level of many clusters with one gaussian each."""
     count = 120_000
     none = np.full(count, -1, np.int32)
     clusters = Clusters(
@@ -117,8 +117,8 @@ def test_damage_of_large_tables_is_found_wherever_it_is(large, tmp_path):
     data = bytearray(large.read_bytes())
     start = 8 + int.from_bytes(data[:8], "little") + 120_000 * 56 + -(120_000 * 56) % 4096
     path = tmp_path / "damaged.v3dg"
-    # Values that every check lets pass: a bit of a box, of the hash of a page, and of
-    # the file's own hash.
+    # Values that pass every other check: a bit of a box, of the hash of a page, and of
+    # the hash of the file.
     for place in (start + 8 * 120_001 + 12 * 120_000 + 1_000_000, len(data) - 20, len(data) - 1):
         data[place] ^= 1
         path.write_bytes(data)
@@ -172,7 +172,7 @@ def test_the_first_file_with_a_fault_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"[\\/]2\.v3dg"):
         Bundle.open_all(paths)
     damaged = bytearray(paths[1].read_bytes())
-    damaged[-1] ^= 1  # its own hash, which is compared last
+    damaged[-1] ^= 1  # the hash of the file is compared last
     paths[1].write_bytes(damaged)
     with pytest.raises(ValueError, match=r"[\\/]1\.v3dg: hash: "):
         Bundle.open_all(paths)

@@ -1,5 +1,5 @@
-"""A figure goes through every pair of formats, and through exports of bundles of any
-up, and stands as it stood."""
+"""A figure stays upright through every pair of formats, and through exports of bundles
+with any up axis."""
 
 import json
 
@@ -22,7 +22,7 @@ from v3dg.export import write_site, write_streamed_sog, write_tiles, write_usd
 from v3dg.formats import _axes
 from v3dg.gaussians import Gaussians
 
-# The largest errors of a round trip, of which those of two formats add up at most.
+# The largest errors of one round trip. The errors of two formats add up at most.
 EXACT = Errors(position=0.0, shape=2e-6, color=0.0, harmonics=0.0)
 LARGEST = {
     ".ply": Errors(position=0.0, shape=2e-6, color=0.0, harmonics=0.0),
@@ -43,7 +43,7 @@ def figure():
 
 @pytest.fixture(scope="module")
 def read_from(figure, tmp_path_factory):
-    """The figure as it is read from a file of a format, by its ending."""
+    """Return the figure as it is read from a file of the format with this suffix."""
     if any(ending.startswith(".usd") for ending in WRITTEN):
         pytest.importorskip("pxr")
     folder = tmp_path_factory.mktemp("sources")
@@ -72,7 +72,7 @@ def test_every_pair_of_formats_keeps_the_figure_upright(
 
 @pytest.fixture(scope="module", params=AXES)
 def tilted(request, figure):
-    """A bundle of the figure of which another axis is up, which it records."""
+    """Return a bundle of the figure with another up axis, which the bundle records."""
     asset = _axes.turned(figure, _axes.MEMORY, _axes.axes_of_up(request.param))
     bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=0), progress=False)
     config = {**bundle.config, "up": request.param}

@@ -1,5 +1,5 @@
-"""Reading and writing 3DGS .ply files. NumPy makes the files and says what they mean,
-not ours."""
+"""Reading and writing .ply files of 3DGS. NumPy creates the files and computes the
+expected values, without our code."""
 
 import os
 import re
@@ -47,7 +47,7 @@ def property_names(degree: int) -> list[str]:
 
 @dataclass
 class Element:
-    """Columns of one element; a column of lists is a list of arrays."""
+    """The columns of an element; a column of lists is a list of arrays."""
 
     name: str
     columns: dict[str, np.ndarray | list[np.ndarray]]
@@ -102,7 +102,7 @@ def random_columns(num: int, degree: int, seed: int = 0) -> dict[str, np.ndarray
 
 
 def expected_gaussians(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What the columns of a file mean, in float64."""
+    """Return the gaussians that the columns of a file stand for, in float64."""
 
     def stacked(*names: str) -> np.ndarray:
         return np.stack([columns[name].astype(np.float64) for name in names], axis=-1)
@@ -141,22 +141,23 @@ def random_gaussians(num: int, degree: int, seed: int = 0) -> Gaussians:
 def assert_close(
     got: Gaussians, wanted: Gaussians | dict[str, np.ndarray], *, scale_error: float
 ) -> None:
-    """Means and SH agree exactly, what is computed up to rounding."""
+    """Assert that means and SH agree exactly, and computed values up to rounding."""
     for name in NAMES:
         value = wanted[name] if isinstance(wanted, dict) else getattr(wanted, name)
         assert getattr(got, name).shape == value.shape
         assert getattr(got, name).dtype == np.float32
-        # Opacities and quaternions: two roundings to float32 of values up to 1.
+        # Opacities and quaternions are rounded to float32 twice, for values up to 1.
         bounds = {"scales": (scale_error, 0), "opacities": (0, 1.2e-7), "quats": (0, 1.2e-7)}
         rtol, atol = bounds.get(name, (0, 0))
         value = np.asarray(value, np.float32)
         np.testing.assert_allclose(getattr(got, name), value, rtol=rtol, atol=atol, err_msg=name)
 
 
-# A log scale of up to 12 is rounded to float32: 12 * 2^-24 on the log, the same
-# relative error on the scale.
+# A log scale of up to 12 is rounded to float32. The absolute error of the logarithm is
+# 12 * 2^-24, and so is the relative error of the scale.
 ROUND_TRIP_SCALE_ERROR = 8e-7
-# The same double, from two libraries' exp, rounded once to float32.
+# The exp functions of two libraries compute the same double, which is rounded to
+# float32 once.
 READ_SCALE_ERROR = 1.2e-7
 
 
@@ -175,8 +176,8 @@ def test_what_is_written_reads_back(tmp_path_factory, num, degree, encoding, see
 
 @st.composite
 def layouts(draw):
-    """(bytes of a file, meaning of its columns): any order, types, encoding, line ends,
-    extra content."""
+    """Yield (bytes of a file, expected columns): any order, types, encoding, line ends,
+    and extra content."""
     num = draw(st.integers(0, 6))
     columns = random_columns(num, draw(st.integers(0, 3)), draw(st.integers(0, 99)))
     main_type = draw(st.sampled_from(["f4", "f8"]))
@@ -220,7 +221,7 @@ def test_reads_any_layout(tmp_path_factory, layout):
     content, expected = layout
     path = tmp_path_factory.getbasetemp() / "layout.ply"
     path.write_bytes(content)
-    file = open_asset(path)  # without what reading an asset may warn of
+    file = open_asset(path)  # without the warnings of reading an asset
     found = file.read(0, file.num_gaussians)
     assert_close(found, expected, scale_error=READ_SCALE_ERROR)
 
@@ -241,7 +242,7 @@ def test_many_blocks_are_written_in_order(tmp_path, encoding):
 
 
 def test_rest_coefficients_are_channel_by_channel_in_the_file(tmp_path):
-    sh = np.arange(12, dtype=np.float32).reshape(1, 4, 3)  # coefficient k, channel c holds 3 k + c
+    sh = np.arange(12, dtype=np.float32).reshape(1, 4, 3)  # coefficient k of channel c is 3 k + c
     one = random_gaussians(1, 1)
     path = tmp_path / "one.ply"
     write_asset(
@@ -597,7 +598,7 @@ def test_every_cut_of_a_file_is_refused(tmp_path, encoding):
     face = Element("face", {"indices": [np.arange(2, dtype="i4")]})
     content = ply_bytes([face, Element("vertex", random_columns(2, 0))], encoding)
     path = tmp_path / "cut.ply"
-    # The last number of a text is still a number when its last digits are gone.
+    # If the last digits of a text are missing, its last number is still a number.
     last = content.rfind(b" ") + 1 if encoding == "ascii" else len(content)
     body = content.index(b"end_header")
     for size in (*range(0, body, 7), *range(body, last)):
@@ -659,7 +660,7 @@ def test_other_suffixes_are_refused(tmp_path):
 
 
 def test_unusual_names_work(tmp_path):
-    # The surrogate stands for a byte that is no UTF-8.
+    # The surrogate stands for a byte that is not UTF-8.
     path = os.path.join(os.fspath(tmp_path), "ünï \udcff.PLY")
     write_asset(path, random_gaussians(3, 0))
     assert len(read_asset(path)) == 3
@@ -749,16 +750,16 @@ def test_reading_needs_the_result_and_writing_next_to_nothing(tmp_path):
         str(tmp_path / "big.ply"),
         str(tmp_path / "copy.ply"),
     ]
-    # Each thread has a buffer, half a megabyte for writing; with more threads the bound
-    # would grow.
+    # Each thread has a buffer, half a megabyte for writing, so the bound would grow
+    # with the number of threads.
     environment = {**os.environ, "OMP_NUM_THREADS": "4"}
     environment["PYTHONPATH"] = str(Path(__import__("v3dg").__file__).parents[1])
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     read_bytes, write_bytes = map(int, done.stdout.split())
     file_bytes = (tmp_path / "big.ply").stat().st_size
-    # The promise is twice the file. The arrays are as large as the file; 16 MiB is left
-    # for buffers (4 x 0.25 MiB), thread stacks and what the allocator rounds up. A
-    # reader that held the file as well would need 2.
+    # The promised limit is twice the file. The arrays are as large as the file. 16 MiB
+    # remain for buffers (4 x 0.25 MiB), the stacks of threads, and rounding by the
+    # allocator. A reader that kept the file as well would need twice the file.
     assert read_bytes < file_bytes + 16 * 2**20 < 1.2 * file_bytes
     assert write_bytes < 16 * 2**20
     assert (tmp_path / "copy.ply").stat().st_size == file_bytes
@@ -767,8 +768,8 @@ def test_reading_needs_the_result_and_writing_next_to_nothing(tmp_path):
 @pytest.mark.parametrize("prefix", ["scalar_", "scal_", "scalar_scal_"])
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_what_cloudcompare_saves_is_read(tmp_path, prefix, encoding):
-    """It puts a prefix before names that it does not know, and so does 3dgsconverter
-    before it; positions may become doubles, and colours stand beside them."""
+    """It adds a prefix to names that it does not know, and so did 3dgsconverter before
+    it. Positions may become doubles, and the file also has colours."""
     columns = random_columns(20, 1)
     kept = ("x", "y", "z")
     named = {name if name in kept else prefix + name: v for name, v in columns.items()}

@@ -20,7 +20,7 @@ Y_UP_TO_Z_UP = (0.5**0.5, 0.5**0.5, 0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def asset():
-    """A donut, of SH degree 1 with light that depends on the direction."""
+    """A donut of SH degree 1 with colours that depend on the direction."""
     donut = make_donut(4000)
     light = np.random.default_rng(0).normal(0, 0.05, (len(donut), 3, 3))
     sh = np.concatenate([donut.sh[:, :1], light.astype(np.float32)], axis=1)
@@ -64,7 +64,7 @@ def test_assets_come_back(tmp_path, asset, name, options, least_db):
 
 
 def test_a_web_page_comes_back(tmp_path, bundle):
-    write_site(bundle, tmp_path / "site", up="-y")  # which turns nothing
+    write_site(bundle, tmp_path / "site", up="-y")  # does not rotate
     assert_back(
         v3dg.read_asset(tmp_path / "site" / "lod-meta.json"), bundle.level_gaussians(0), 50.0
     )
@@ -74,7 +74,8 @@ def test_tiles_come_back(tmp_path, bundle):
     write_tiles(bundle, tmp_path / "tiles", up="z")
     files = sorted((tmp_path / "tiles" / "bundle").glob("0_*.glb"))
     tiles = v3dg.Gaussians.concatenate([v3dg.read_asset(file) for file in files])
-    # In the files what was y is z, and reading a `.glb` turns by half a turn about z.
+    # In the files, y was exchanged with z. Reading a `.glb` rotates by half a turn
+    # about z.
     in_file = half_turn(tiles, "z")
     assert_back(in_file.transform(quaternion=Y_UP_TO_Z_UP), bundle.level_gaussians(0), 50.0)
 

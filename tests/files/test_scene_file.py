@@ -92,7 +92,7 @@ def put(path, document):
 
 
 def test_instances_are_added_at_once_whatever_their_order(tmp_path, monkeypatch):
-    """So that time grows with their number, and not with its square."""
+    """The time then grows in proportion to their number, and not to its square."""
     instances = [{"bundle": "ab"[i % 2], "position": [i, 0, 0]} for i in range(100)]
     document = {
         "format": "v3dg-scene",
@@ -131,7 +131,8 @@ def test_missing_bundle_is_named(tmp_path):
 
 
 def changed(place, value, document=GOOD):
-    """A document with the value at a place, as keys and indices; None removes it."""
+    """Return a document with the value at a place of keys and indices; None removes the
+    place."""
     document = json.loads(json.dumps(document))
     target = document
     for key in place[:-1]:
@@ -266,8 +267,8 @@ MATRIX = [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 1], [0, 0, 0, 1]]
 
 
 def published_layout():
-    """As the paper's code has them: two assets, one with the notes of the program that
-    placed it."""
+    """Write a layout as in the published code of V3DG: two assets, one with notes of
+    the program that placed it."""
     camera = {
         "camera_name": "camera_0",
         "camera_width": 64,
@@ -327,7 +328,7 @@ def test_published_layouts_are_read(tmp_path):
 
 
 def test_published_layouts_find_bundles_where_a_build_puts_them(tmp_path):
-    """Beside the layout, or beside the assets of the published code."""
+    """The bundles are beside the layout, or beside the assets of the published code."""
     (tmp_path / "layouts").mkdir()
     path = put(tmp_path / "layouts" / "layout.json", published_layout())
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Scene files: axes that are up, matrices, opacity and tint, and scenes in scenes."""
+"""Scene files: up axes, matrices, opacity and tint, and nested scenes."""
 
 import json
 import re
@@ -15,7 +15,7 @@ QUARTER = [[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
 
 
 def put(path, *instances, scenes=(), **fields):
-    """A scene file of a bundle `a`, and of scenes by their names."""
+    """Write a scene file of a bundle `a` and of scenes by their names."""
     document = {"format": "v3dg-scene", "version": 1, "instances": list(instances), **fields}
     if any("bundle" in instance for instance in instances):
         document["bundles"] = {"a": "a.v3dg"}

@@ -1,5 +1,5 @@
-"""What trainers and other programs write differently: it is read as it is meant, and
-what is left out is told."""
+"""Variants of trainers and other programs are read with their intended meaning, and the
+reader reports what is left out."""
 
 import gzip
 import io
@@ -23,7 +23,7 @@ from test_ply import (
     random_gaussians,
 )
 from v3dg import write_asset
-from v3dg.io import open_asset
+from v3dg.io import asset_bytes, open_asset
 
 SH_C0 = 0.28209479177387814
 NORMALS = ["nx", "ny", "nz"]
@@ -46,7 +46,7 @@ ORDERS = {
 
 
 def read(path):
-    """All gaussians, without what reading them may warn of."""
+    """Return all gaussians, without warnings."""
     file = open_asset(path)
     return file.read(0, file.num_gaussians)
 
@@ -83,10 +83,10 @@ COLORS = {
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("kind", COLORS)
 def test_base_colours_stand_for_coefficients(tmp_path, kind, encoding):
-    """As nerfstudio writes them with `--ply-color-mode rgb`."""
+    """nerfstudio writes them like this with `--ply-color-mode rgb`."""
     dtype, largest, names = COLORS[kind]
     if encoding == "ascii" and dtype == "f2":
-        dtype = "f4"  # text of a half is as long as that of a float
+        dtype = "f4"  # the text of a half is as long as that of a float
     rng = np.random.default_rng(0)
     columns = random_columns(20, 0)
     wanted = dict(columns)
@@ -131,7 +131,8 @@ def test_gaussians_of_2dgs_have_no_thickness(tmp_path, encoding):
 
 
 def test_the_filter_of_mip_splatting_is_applied(tmp_path):
-    """As `get_scaling_with_3D_filter` and `get_opacity_with_3D_filter` of its code."""
+    """The formulas are those of `get_scaling_with_3D_filter` and
+    `get_opacity_with_3D_filter` in its code."""
     columns = random_columns(20, 1)
     sizes = np.random.default_rng(1).uniform(0, 2, 20).astype(np.float32)
     sizes[0] = 0
@@ -215,7 +216,7 @@ def test_what_a_compressed_ply_has_besides_is_told(tmp_path):
 
 
 def sog_files(path, change=(), folder=""):
-    """The files of a SOG, with some fields of meta.json changed, below a folder."""
+    """Write the files of a SOG to a folder, with some fields of meta.json changed."""
     with zipfile.ZipFile(path) as archive:
         files = {folder + name: archive.read(name) for name in archive.namelist()}
     meta = json.loads(files[f"{folder}meta.json"]) | dict(change)
@@ -310,7 +311,7 @@ FILES += ["sh3_mkkellogg_2.ksplat", "sh0_gaussforge.splat"]
 
 
 def test_only_records_are_recognised_as_a_splat(tmp_path):
-    """A `.splat` has no mark: its numbers show what it is."""
+    """A `.splat` file has no signature, so its numbers must show that it is one."""
     content = (FIXTURES / "sh0_gaussforge.splat").read_bytes()
     path = tmp_path / "a.ply"
     turned = bytearray(content)
@@ -350,7 +351,7 @@ def test_a_ply_called_splat_is_recognised(tmp_path):
 
 
 def test_a_splat_that_begins_like_a_ksplat_is_a_splat(tmp_path):
-    """Only its first numbers are those of a header."""
+    """Only its first numbers look like those of a header."""
     rows = np.random.default_rng(0).integers(1, 255, (200, 32)).astype(np.uint8)
     rows[0] = np.frombuffer(struct.pack("<BB2xIIIIH10x", 0, 1, 1, 1, 1, 1, 0), np.uint8)
     (tmp_path / "a.splat").write_bytes(rows.tobytes())
@@ -360,12 +361,19 @@ def test_a_splat_that_begins_like_a_ksplat_is_a_splat(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.gz", "a", "a.bin"])
-def test_files_of_unknown_names_are_named_by_what_they_are(tmp_path, name):
+def test_files_of_unknown_names_are_read_by_their_content(tmp_path, name):
     shutil.copyfile(FIXTURES / "sh3.sog", tmp_path / name)
-    with pytest.raises(ValueError, match=r"this is a \.sog, so rename it to end in that$"):
-        read(tmp_path / name)
+    file = open_asset(tmp_path / name)
+    wanted = open_asset(FIXTURES / "sh3.sog")
+    note = "The end of its name is unknown; the file is a .sog and was read as such."
+    assert file.declared.notes == (note, *wanted.declared.notes)
+    np.testing.assert_array_equal(file.read(0, 10).means, wanted.read(0, 10).means)
+    assert asset_bytes(tmp_path / name) == (tmp_path / name).stat().st_size
     (tmp_path / name).write_bytes(gzip.compress(b"ply\nformat ascii 1.0\n"))
     with pytest.raises(ValueError, match=r"this is a gzip of a \.ply; unpack it$"):
+        read(tmp_path / name)
+    (tmp_path / name).write_bytes(b"PXR-USDC" + bytes(100))
+    with pytest.raises(ValueError, match=r"this is a \.usdc, so rename it to end in that$"):
         read(tmp_path / name)
 
 

@@ -1,4 +1,4 @@
-"""Files at URLs, as fsspec fetches them."""
+"""Files at URLs, which fsspec fetches."""
 
 import contextlib
 import gc
@@ -40,7 +40,7 @@ URL = "memory://in/many.v3dg"
 
 @pytest.fixture
 def there(monkeypatch):
-    """A place that only fsspec reaches."""
+    """A place that only fsspec can reach."""
     monkeypatch.setattr("v3dg._urls.opened._opened", {})
     memory = fsspec.filesystem("memory")
     yield memory
@@ -49,7 +49,7 @@ def there(monkeypatch):
 
 @pytest.fixture
 def fetched(there, monkeypatch):
-    """The parts of files that were fetched from there, in a list."""
+    """Return a list of the parts of files that were fetched from there."""
     parts, fetch = [], type(there).cat_file
 
     def counted(self, path, start=None, end=None, **options):
@@ -62,7 +62,7 @@ def fetched(there, monkeypatch):
 
 
 def put(there, tmp_path, seed=0):
-    """A bundle of about 250 pages there; the same here."""
+    """A bundle of about 250 pages there, and the same file here."""
     rng = np.random.default_rng(seed)
     path = tmp_path / "many.v3dg"
     lod_bundle(rng, blob(rng, 5000, sh_degree=1), 32).write(path)
@@ -145,7 +145,7 @@ def test_pictures_fetch_what_they_need_and_no_part_twice(fetched, many):
             bundle.level_gaussians(level).means, here.level_gaussians(level).means
         )
     np.testing.assert_array_equal(v3dg.open(URL).gaussians.sh, here.gaussians.sh)
-    # Blocks in which pages meet may have been on their way for two of them.
+    # Blocks that contain parts of two pages may have been requested for both.
     assert num_bytes(fetched) <= many.stat().st_size + 1024 * len(fetched)
     count = len(fetched)
     assert bundle.gaussians is not None
@@ -197,7 +197,7 @@ def test_a_server_that_does_not_answer_ends_the_wait(there, many, monkeypatch):
     start = time.monotonic()
     with pytest.raises(TimeoutError, match="pages are missing and none arrived"):
         renderer.settle(NEAR, timeout=0.2, **FINE)
-    assert renderer.render(NEAR, **FINE).stats.missing > 0  # which waits for nothing
+    assert renderer.render(NEAR, **FINE).stats.missing > 0  # does not wait
     assert time.monotonic() - start < 30
     answers.set()
     renderer.settle(NEAR, **FINE)
@@ -242,7 +242,7 @@ def test_a_file_of_unknown_size_is_fetched_whole(there, fetched, many, monkeypat
 
 
 def test_a_process_ends_while_parts_are_on_their_way(tmp_path):
-    """Also with threads that wait for Python."""
+    """This also holds while threads wait for Python."""
     code = """
 import sys, time
 import fsspec, numpy as np
@@ -265,7 +265,7 @@ for _ in range(3):
 
 
 class _Handler(http.server.SimpleHTTPRequestHandler):
-    """Of one folder, which knows ranges, and counts."""
+    """Serves one folder, with ranges, and counts the bytes that it sends."""
 
     protocol_version = "HTTP/1.1"
     knows_ranges = True
@@ -305,7 +305,7 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def web(tmp_path, monkeypatch):
-    """A web server of a folder, its address and the bytes of what it sent."""
+    """A web server of a folder: its address and the number of bytes that it sent."""
     pytest.importorskip("aiohttp")
     monkeypatch.setattr("v3dg._urls.opened._opened", {})
 
@@ -555,8 +555,8 @@ NAMES = {
 
 @pytest.fixture
 def names(web, monkeypatch):
-    """Hosts by name, all of which this server is: 127.0.0.1 counts as public, all else
-    as private."""
+    """Make this server all of these hosts: 127.0.0.1 then counts as public, and other
+    addresses as private."""
     known = dict(NAMES)
 
     async def resolve(host, port):
@@ -572,7 +572,8 @@ def names(web, monkeypatch):
 
 
 def redirecting(web, places):
-    """Have the server send each path on to a place, of which `{port}` is its own."""
+    """Make the server redirect each path to an address, in which `{port}` is its own
+    port."""
     answer = web.handler.answer
 
     def redirected(self, with_body):
@@ -813,7 +814,7 @@ def test_descriptors_of_what_has_changed_are_closed(web, tmp_path):
 
 
 def _open_files():
-    """Yield what the descriptors of this process refer to; other threads may close some
+    """Yield the targets of this process's descriptors; other threads may close some
     meanwhile."""
     for name in os.listdir("/proc/self/fd"):
         with contextlib.suppress(FileNotFoundError):
@@ -839,7 +840,8 @@ def test_every_format_is_read_from_a_url_and_names_it_in_errors(there, tmp_path,
 
 
 def test_a_gltf_at_a_url_has_its_buffers_inside(there, tmp_path):
-    """It is read from an open file of this process, beside which are all others."""
+    """It is read through an open file of this process, whose folder contains all other
+    open files."""
     asset = random_gaussians(np.random.default_rng(0), 30)
     file = GltfFile()
     file.nodes({"mesh": file.mesh(asset)})

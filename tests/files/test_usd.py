@@ -1,4 +1,5 @@
-"""OpenUSD, in and out, checked with its own validators and its own choice of levels."""
+"""OpenUSD is read and written. OpenUSD's own validators check the files, and its own
+choice of levels is tested."""
 
 import json
 import math
@@ -14,6 +15,7 @@ from command_line import run
 from half_turns import half_turn
 from random_bundle import random_bundle, random_gaussians
 from v3dg.export import write_usd
+from v3dg.formats._packing import SH_C0
 from v3dg.io import open_asset
 
 pytest.importorskip("pxr")
@@ -44,6 +46,19 @@ def test_an_asset_reads_back(tmp_path, suffix, degree):
     assert os.listdir(tmp_path) == [f"a.{suffix}"]
     if suffix == "usda":
         assert (tmp_path / "a.usda").read_text().startswith("#usda 1.0")
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_coefficients_say_how_many_belong_to_a_gaussian(tmp_path, degree):
+    """Requirement VG.035 of NVIDIA's usd-validation: interpolation `vertex`, and an
+    elementSize of the degree's number of coefficients."""
+    path = tmp_path / "a.usdc"
+    v3dg.write_asset(path, random_gaussians(np.random.default_rng(0), 5, degree))
+    stage = Usd.Stage.Open(os.fspath(path))
+    prim = stage.GetDefaultPrim()
+    harmonics = UsdGeom.Primvar(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients"))
+    assert harmonics.GetInterpolation() == "vertex"
+    assert harmonics.GetElementSize() == (degree + 1) ** 2
 
 
 def test_no_gaussians_are_written(tmp_path):
@@ -87,8 +102,7 @@ def test_a_bundle_has_its_levels(tmp_path, seed):
 
 
 def test_usd_chooses_the_level_that_selection_has(tmp_path):
-    """Level 1 begins where half of its groups are enough, for a picture of 1920 x
-    1080."""
+    """In a picture of 1920 x 1080, level 1 begins where half of its groups suffice."""
     bundle = random_bundle(3, num_levels=4)
     write_usd(bundle, tmp_path / "a.usdc", up="z")
     stage = Usd.Stage.Open(os.fspath(tmp_path / "a.usdc"))
@@ -123,8 +137,8 @@ def test_a_scene_is_a_point_instancer(tmp_path):
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/world")))
     np.testing.assert_allclose([0, 1, 0, 0] @ world, [0, 0, 1, 0], atol=1e-6)  # y becomes z
     for i, matrix in enumerate(matrices):
-        # USD has vectors as rows; instances are before the prototypes' own transforms,
-        # which have none.
+        # Vectors in OpenUSD are rows. Instances come before the prototypes' own
+        # transforms, which are empty.
         np.testing.assert_allclose(
             matrix[:3, :3].T, scene.scales[i] * scene.rotations[i], atol=1e-3
         )
@@ -192,7 +206,7 @@ def test_without_usd_core_the_error_says_how_to_get_it(tmp_path, monkeypatch):
 
 
 def world_means(scene):
-    """Means of all gaussians of the finest levels, in the world."""
+    """Return the means of all gaussians of the finest levels, in the world."""
     found = [scene.bundles[b].level_gaussians(0).means for b in scene.instance_bundle]
     poses = zip(found, scene.rotations, scene.scales, scene.positions, strict=True)
     means = np.concatenate(
@@ -221,8 +235,8 @@ def test_a_scene_reads_back_as_a_scene(tmp_path, suffix):
 
 @pytest.mark.parametrize("is_instanceable", [True, False])
 def test_references_to_an_asset_are_instances_of_it(tmp_path, is_instanceable):
-    """Of files beside, in Xforms in Xforms; what is alone has one, and changed values
-    are another asset."""
+    """The references are to files in the same folder, from nested Xforms. An asset
+    without references is one instance, and a changed asset is another asset."""
     asset = Usd.Stage.CreateNew(os.fspath(tmp_path / "asset.usdc"))
     asset.SetDefaultPrim(UsdGeom.Xform.Define(asset, "/house").GetPrim())
     v3dg.formats.usd.define(
@@ -267,7 +281,7 @@ def test_instancers_may_hold_instancers_and_hide_instances(tmp_path):
         )
         instancer.CreateProtoIndicesAttr([0, 0, 0])
         instancer.CreatePositionsAttr([Gf.Vec3f(*step) * k for k in range(3)])
-        # In half precision, as most programs write them.
+        # In half precision, like most programs.
         instancer.CreateOrientationsAttr([Gf.Quath(0.5, 0.5, -0.5, 0.5)] * 3)
     UsdGeom.PointInstancer(stage.GetPrimAtPath("/rows")).InvisId(1, 0)
     stage.GetRootLayer().Save()
@@ -304,7 +318,7 @@ def new_stage(path):
 
 
 def read_with_notes(path):
-    """Gaussians with the axes of their stage, and what else is declared."""
+    """Return gaussians in the axes of their stage, and what else the file declares."""
     file = open_asset(path)
     return half_turn(file.read(0, file.num_gaussians), "x"), list(file.declared.notes)
 
@@ -313,7 +327,8 @@ POINTS = [Gf.Vec3f(1, 2, 3), Gf.Vec3f(4, 5, 6)]
 
 
 def test_what_is_left_out_has_the_default_of_the_schema(tmp_path):
-    """Which its documentation has: no rotation, unit scale, opaque, of one grey."""
+    """The defaults in its documentation are: no rotation, unit scale, opaque, and one
+    grey."""
     stage = new_stage(tmp_path / "a.usda")
     new_prim(stage).GetAttribute("positions").Set(POINTS)
     stage.GetRootLayer().Save()
@@ -347,7 +362,8 @@ def test_the_degree_of_harmonics_is_3_by_default(tmp_path):
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_array_equal(found.sh, values.reshape(2, 16, 3))
     assert notes == []
-    # Of degree 4 they are too few, and ignored; of degree 2 the last ones are left out.
+    # They are too few for degree 4, and ignored; for degree 2 the last ones are left
+    # out.
     prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(4)
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
@@ -382,7 +398,7 @@ def test_coefficients_above_degree_3_are_left_out(tmp_path):
 
 
 def test_halves_stand_for_floats(tmp_path):
-    """Where there are both, floats are used."""
+    """If a file has both, the floats are used."""
     stage = new_stage(tmp_path / "a.usda")
     prim = new_prim(stage)
     prim.GetAttribute("positionsh").Set([Gf.Vec3h(1, 2, 3), Gf.Vec3h(4, 5, 6)])
@@ -477,6 +493,50 @@ def test_what_a_prim_says_besides_is_told(tmp_path):
         "The hint sortingModeHint is 'rayHitDistance' and was ignored.",
         "Attributes of gaussians were ignored: 'velocities'.",
     ]
+
+
+def stage_with_color_space(path, asset, name, place):
+    """A stage whose coefficients are in the colour space `name`, which `place`
+    declares."""
+    stage = new_stage(path)
+    world = UsdGeom.Xform.Define(stage, "/world").GetPrim()
+    prim = v3dg.formats.usd.define(stage, "/world/a", half_turn(asset, "x"))
+    prim.RemoveProperty("colorSpace:name")
+    if place == "attribute":
+        prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").SetColorSpace(name)
+    else:
+        declaring = {"prim": prim, "parent": world}[place]
+        Usd.ColorSpaceAPI.Apply(declaring).CreateColorSpaceNameAttr(name)
+    stage.GetRootLayer().Save()
+
+
+@pytest.mark.parametrize("place", ["attribute", "prim", "parent"])
+@pytest.mark.parametrize("name", ["lin_rec709_scene", "srgb_rec709_scene", "lin_ap1_scene"])
+def test_the_colour_space_of_coefficients_counts(tmp_path, name, place):
+    """Whatever declares it. Linear grey of 0.2 is 0.4845 in sRGB (IEC 61966-2-1)."""
+    asset = random_gaussians(np.random.default_rng(0), 3, 1)
+    asset.sh[:] = 0
+    asset.sh[:, 0] = (0.2 - 0.5) / SH_C0
+    stage_with_color_space(tmp_path / "a.usda", asset, name, place)
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    expected = 0.2
+    words = []
+    if name == "lin_rec709_scene":
+        expected = 0.4845
+        words = ["linear (lin_rec709_scene)"]
+    elif name == "lin_ap1_scene":
+        words = ["'lin_ap1_scene' was read as sRGB"]
+    np.testing.assert_allclose(found.sh[:, 0] * SH_C0 + 0.5, expected, atol=1e-4)
+    np.testing.assert_allclose(found.sh[:, 1:], 0, atol=1e-4)
+    assert len(notes) == len(words)
+    assert all(word in note for word, note in zip(words, notes, strict=True))
+
+
+def test_written_coefficients_declare_their_colour_space(tmp_path):
+    v3dg.write_asset(tmp_path / "a.usda", random_gaussians(np.random.default_rng(0), 3, 1))
+    stage = Usd.Stage.Open(os.fspath(tmp_path / "a.usda"))
+    prim = stage.GetPrimAtPath("/gaussians")
+    assert Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr().Get() == "srgb_rec709_scene"
 
 
 @pytest.mark.parametrize(

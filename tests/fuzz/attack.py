@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
-"""Attack v3dg with broken files, odd commands and calls, signals, threads and limits;
-keep what is wrong.
+"""Attacks v3dg with broken files, unusual commands and calls, signals, threads and
+limits, and keeps the inputs that show a fault.
 
     python tests/fuzz/attack.py all --seconds 3600
     python tests/fuzz/attack.py files commands --tries 500 --seed 7
     python tests/fuzz/attack.py files --seed 7 --only 123
 
-A kind is a module of attacks/, which says what it tries and what is right. Tries are
-numbered, and a seed and a number give the same try. A line of JSON is printed for each
-kind, with the numbers of the tries that found something; what these had on disk is kept
-in build/attack/KIND/SEED-NUMBER. The exit code is 1 where something was found. What is
-only "low", a message that could say more, is counted beside the findings.
+Each kind of attack is a module in attacks/, which describes what it tries and what is
+right. Tries are numbered, and the same seed and number give the same try. For each kind
+a line of JSON is printed, with the numbers of the tries that found a fault. Their files
+are kept in build/attack/KIND/SEED-NUMBER. The exit code is 1 if a fault was found.
+Findings that are only "low", which are messages that could say more, are counted
+separately.
 """
 
 import argparse
@@ -22,7 +23,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from fuzz.attacks.pool import attack
 
-# Shares of the time when all are run: what finds most in a second needs least of it.
+# Shares of the time if all kinds run. Kinds that find most per second need the least
+# time.
 KINDS = {
     "files": 0.3,
     "commands": 0.15,

@@ -1,4 +1,5 @@
-"""Changes that keep a document's form, which changes of bytes nearly never do."""
+"""Changes that keep the form of a document, which random changes of bytes hardly ever
+do."""
 
 import json
 
@@ -40,8 +41,8 @@ VALUES = (
 
 
 def changed_json(text, rng):
-    """The document of the text with one value or key changed; the text itself where it
-    is no document."""
+    """Return the document of the text with one value or key changed, or the text itself
+    if it is no document."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError):
@@ -65,7 +66,7 @@ def changed_json(text, rng):
 
 
 def _places(value):
-    """Every value in the document, as what holds it and where."""
+    """Yield the container and the key of every value in the document."""
     keys = (
         value.keys()
         if isinstance(value, dict)

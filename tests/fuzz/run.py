@@ -24,7 +24,7 @@ from test_ply import HOSTILE, Element, ply_bytes, random_columns
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
 MAX_BYTES, KEPT_BYTES = 8192, 1000
-LARGEST_SEED = 10_000  # bytes; a few of the broken files are made to be large
+LARGEST_SEED = 10_000  # bytes; a few of the broken files are made large
 
 
 def ply_seeds():

@@ -1,5 +1,5 @@
-"""Readers, and what must hold whatever they read, for inputs that were kept; and zips
-for all."""
+"""Readers with the conditions that must hold for any input, for inputs that were kept,
+and zips of all inputs."""
 
 import gzip
 import io
@@ -31,8 +31,8 @@ def read_ply(content, folder):
 
 
 def read_bundle(content, folder):
-    """Nearly every change of a file is found by its hashes, so it is read again with
-    hashes that fit."""
+    """The hashes detect nearly every change of a file, so it is also read with
+    corrected hashes."""
     for data in (content, with_fitting_hashes(content)):
         path = put(folder / "fuzz.v3dg", data)
         with only_errors_that_name(path):
@@ -51,8 +51,8 @@ def read_json(content, folder):
 
 
 def read_format(content, folder):
-    """The first byte tells the format, and whether the rest is a file of it or what is
-    packed in one."""
+    """The first byte tells the format, and whether the rest is a file of this format or
+    the content of its compressed part."""
     suffix, packed = FORMATS[content[0] % len(FORMATS)] if content else FORMATS[0]
     path = put(folder / f"fuzz{suffix}", packed(content[1:]))
     with only_errors_that_name(path):
@@ -62,7 +62,7 @@ def read_format(content, folder):
 
 
 def zip_bytes(entries, compression=zipfile.ZIP_STORED):
-    """A zip of names and contents; a name may be there twice."""
+    """Return a zip of names and contents; a name may occur twice."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", compression) as archive:
         for name, content in entries:
@@ -72,8 +72,8 @@ def zip_bytes(entries, compression=zipfile.ZIP_STORED):
 
 
 def small_sog():
-    """The files of a SOG, its tables cut to four values, so that most changes of it
-    change something else."""
+    """Return the files of a SOG whose tables have only four values, so that most
+    changes affect something else."""
     files = sog.encode(random_gaussians(np.random.default_rng(0), 3, sh_degree=1))
     meta = json.loads(files["meta.json"])
     for name in ("scales", "sh0", "shN"):
@@ -101,7 +101,7 @@ def put(path, content):
 
 
 class only_errors_that_name:
-    """Lets those errors end the block that a reader may raise: of one line that begins
+    """Let the block end with the errors that a reader may raise: one line that begins
     with the name."""
 
     def __init__(self, name):
@@ -119,8 +119,8 @@ class only_errors_that_name:
 
 
 def parts_of(data):
-    """Header, its end, and from there the ends of pages and file's hash; None where
-    they are not there."""
+    """Return the header, its end, and from there the ends of the pages and of the
+    file's hash; None if the file lacks them."""
     start = 8 + int.from_bytes(data[:8], "little")
     try:
         header = json.loads(data[8:start])
@@ -132,8 +132,8 @@ def parts_of(data):
 
 
 def with_fitting_hashes(data):
-    """The file with the hashes of its pages and its own made anew, as far as its header
-    leads to them."""
+    """Return the file with corrected hashes of its pages and of itself, as far as its
+    header leads to them."""
     data = bytearray(data)
     try:
         header, start, pages_end, hash_end = parts_of(data)

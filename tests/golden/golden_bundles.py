@@ -1,5 +1,5 @@
-"""Small bundles, of each version of the format; run it to write those of the newest,
-once and never again."""
+"""Small bundles of each version of the format. Running this file writes those of the
+newest version, which is done once only."""
 
 from pathlib import Path
 

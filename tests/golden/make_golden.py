@@ -1,5 +1,5 @@
-"""Writes gsplat_projection.npz: what gsplat's pure-torch functions make of the scenes
-of `golden_scenes`.
+"""Writes gsplat_projection.npz: the results of gsplat's functions in plain torch for
+the scenes of `golden_scenes`.
 
 Run as `python tests/golden/make_golden.py`. Needs torch and gsplat (`pip install
 --no-deps gsplat==1.5.3`), not CUDA.
@@ -24,9 +24,9 @@ NUM = 12
 
 
 def golden_scenes():
-    """Name, gaussians, camera; SH of degree 3."""
+    """Yield the name, the gaussians and the camera of each scene; SH has degree 3."""
     for i, (name, camera) in enumerate(scenes.CAMERAS.items()):
-        # Far beyond the image too, where the Jacobian is clamped.
+        # Some gaussians are far outside the picture, where the Jacobian is clamped.
         yield (
             name,
             scenes.random_gaussians(
@@ -37,8 +37,8 @@ def golden_scenes():
 
 
 def load_gsplat():
-    """gsplat's torch functions as a module; None where gsplat is not installed. Its
-    package needs CUDA."""
+    """Return gsplat's torch functions as a module; None if gsplat is not installed. The
+    package itself needs CUDA."""
     spec = importlib.util.find_spec("gsplat")
     if spec is None or spec.origin is None:
         return None
@@ -50,8 +50,8 @@ def load_gsplat():
 
 
 def evaluate(gsplat, gaussians, camera) -> dict[str, np.ndarray]:
-    """Projections for both filters, colours for all degrees, gradients of a fixed
-    weighting of them all."""
+    """Return projections for both filters, colours for all degrees, and gradients of a
+    fixed weighted sum of all."""
     import torch
 
     def leaf(array):
@@ -93,7 +93,7 @@ def evaluate(gsplat, gaussians, camera) -> dict[str, np.ndarray]:
 
 
 def weights(shape) -> np.ndarray:
-    """Fixed and different for every element."""
+    """Return weights that are fixed, and different for every element."""
     return np.cos(1.0 + 1.7 * np.arange(np.prod(shape), dtype=np.float64)).reshape(shape)
 
 
@@ -105,7 +105,7 @@ def main() -> None:
     for name, gaussians, camera in golden_scenes():
         for key, value in evaluate(gsplat, gaussians, camera).items():
             arrays[f"{name}/{key}"] = value
-        # The scene itself, so that the file stays true when the scene generator
+        # The file contains the scene, so that it stays valid if the generator of scenes
         # changes.
         for key in scenes.NAMES:
             arrays[f"{name}/{key}"] = getattr(gaussians, key)

@@ -7,8 +7,8 @@ import numpy as np
 
 
 def median_split(means: np.ndarray, cluster_size: int) -> list[list[int]]:
-    """Indices of each leaf: halve at the median rank of the longest axis; ties: lower
-    axis, lower index."""
+    """Return the indices of each leaf. Sets are halved at the median rank along the
+    longest axis; ties go to the lower axis and the lower index."""
     leaves = [list(range(len(means)))]
     while max(len(leaf) for leaf in leaves) > cluster_size:
         leaves = [half for leaf in leaves for half in _halves(means, leaf, 1)]
@@ -16,8 +16,8 @@ def median_split(means: np.ndarray, cluster_size: int) -> list[list[int]]:
 
 
 def runs(means: np.ndarray, unit: int) -> list[list[int]]:
-    """Indices of each run: halve at ranks that are multiples of `unit`, until no part
-    has more points than that."""
+    """Return the indices of each run. Sets are halved at ranks that are multiples of
+    `unit`, until no part has more points than that."""
     parts = [list(range(len(means)))]
     while max(len(part) for part in parts) > unit:
         parts = [half for part in parts for half in _halves(means, part, unit)]
@@ -28,7 +28,7 @@ def _halves(means: np.ndarray, indices: list[int], unit: int) -> tuple[list[int]
     if not indices:
         return [], []
     points = means[indices]
-    axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))  # the first of equals
+    axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))  # the first of equal axes
     ranked = sorted(indices, key=lambda i: (float(means[i, axis]), i))
     num_units = -(-len(ranked) // unit)
     num_left = (num_units + 1) // 2 * unit

@@ -8,7 +8,7 @@ BINS, ROUNDS, EVEN = 4096, 16, 0.25
 
 
 def codebook_of(values):
-    """256 ascending numbers near the values (N,)."""
+    """Return 256 ascending numbers near the values (N,)."""
     distinct = np.unique(values)
     if len(distinct) <= SIZE:
         return (
@@ -26,7 +26,8 @@ def codebook_of(values):
 
 
 def palette_of(vectors, size):
-    """Vectors (K, D) that stand for many (N, D), and which of them for each (N,)."""
+    """Return vectors (K, D) that approximate many (N, D), and the index of the vector
+    for each (N,)."""
     vectors = vectors.astype(np.float64)
     parts = [np.arange(len(vectors))] if len(vectors) else []
     while parts and len(parts) < size:
@@ -47,8 +48,8 @@ def palette_of(vectors, size):
 
 
 def morton_order(means):
-    """Indices that sort points (N, 3) by the interleaved bits of their cells, 2^21 a
-    side."""
+    """Return indices that sort points (N, 3) by the interleaved bits of their cells,
+    2^21 per side."""
     if not len(means):
         return np.zeros(0, np.int64)
     low = means.min(axis=0).astype(np.float64)

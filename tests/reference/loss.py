@@ -1,4 +1,5 @@
-"""The loss of local splatting on torch tensors of any precision, and 1 - SSIM in it."""
+"""The loss of local splatting on torch tensors of any precision, and 1 - SSIM, which is
+a part of it."""
 
 from __future__ import annotations
 
@@ -6,15 +7,15 @@ import torch
 
 
 def window() -> torch.Tensor:
-    """(11, 11) gaussian of sigma 1.5 that sums to 1."""
+    """Return an (11, 11) gaussian with sigma 1.5 that sums to 1."""
     x = torch.arange(-5, 6, dtype=torch.float64)
     line = torch.exp(-(x**2) / (2 * 1.5**2))
     return torch.outer(line, line) / line.sum() ** 2
 
 
 def dssim(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Mean of 1 - SSIM over one channel (H, W), zeros beyond the border (Wang et al.
-    2004)."""
+    """Return the mean of 1 - SSIM over one channel (H, W), with zeros beyond the border
+    (Wang et al. 2004)."""
 
     def blur(image: torch.Tensor) -> torch.Tensor:
         kernel = window().to(image.dtype)[None, None]
@@ -30,9 +31,9 @@ def dssim(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def loss(color, alpha, target_color, target_alpha, weights) -> torch.Tensor:
-    """L1 on premultiplied colour (H, W, 3), 1 - SSIM of it, L1 on alpha (H, W), and
-    relative to both L1 parts that of the means of cells of 4 x 4 px; `weights` in this
-    order."""
+    """Return the weighted sum of L1 on premultiplied colour (H, W, 3), 1 - SSIM of it,
+    L1 on alpha (H, W), and, relative to both parts with L1, those of the means of cells
+    of 4 x 4 px; `weights` are in this order."""
     l1, ssim, on_alpha, on_cells = weights
     differences = torch.cat([color - target_color, (alpha - target_alpha)[..., None]], dim=-1)
     cells = torch.nn.functional.avg_pool2d(differences.permute(2, 0, 1), 4)

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FIELD_OF_VIEW_MARGIN = 0.3  # of half the field of view: where the Jacobian stops to follow the mean
+# This is a share of half the field of view. Beyond it the Jacobian no longer follows
+# the mean.
+FIELD_OF_VIEW_MARGIN = 0.3
 
 
 @dataclass(frozen=True)
@@ -18,15 +20,17 @@ class Projection:
     mean_px: np.ndarray  # (N,2)
     covariance_px2: np.ndarray  # (N,2,2), filter included
     determinant: np.ndarray  # (N,) of that covariance
-    # (N,) factor on the opacity that keeps a gaussian's integral under the filter.
+    # (N,) factor on the opacity that preserves the integral of a gaussian under the
+    # filter.
     compensation: np.ndarray
     depth: np.ndarray  # (N,)
-    is_drawable: np.ndarray  # (N,) not nearer than the near plane, finite, covers an area
+    # (N,) at least as far as the near plane, finite, and with a positive area
+    is_drawable: np.ndarray
 
 
 def rotation(quats: np.ndarray) -> np.ndarray:
-    """(N,3,3) of quaternions (N,4) w,x,y,z of any length: columns are q e q*. Zero
-    stands for no rotation."""
+    """Return rotations (N,3,3) of quaternions (N,4) w,x,y,z of any length: v becomes q
+    v q*. Zero means no rotation."""
     quats = np.asarray(quats, np.float64)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     w, v = np.split(
@@ -41,7 +45,7 @@ def rotation(quats: np.ndarray) -> np.ndarray:
 
 
 def covariance(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """(N,3,3) in the gaussians' own space."""
+    """Return (N,3,3) in the gaussians' own space."""
     axes = rotation(quats) * np.asarray(scales, np.float64)[:, None, :]
     return axes @ axes.transpose(0, 2, 1)
 
@@ -49,7 +53,8 @@ def covariance(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
 def project(gaussians, camera, *, filter_px2: float = 0.0) -> Projection:
     means = np.asarray(gaussians.means, np.float64)
     to_view, origin = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    # What is behind the camera or not finite is sorted out at the end.
+    # Gaussians behind the camera or with values that are not finite are removed at the
+    # end.
     with np.errstate(all="ignore"):
         view = means @ to_view.T + origin
         depth = view[:, 2]
@@ -65,8 +70,8 @@ def project(gaussians, camera, *, filter_px2: float = 0.0) -> Projection:
         axes = rotation(gaussians.quats) * np.asarray(gaussians.scales, np.float64)[:, None, :]
         rows = jacobian @ to_view @ axes  # (N,2,3): the covariance is rows rows^T
         unfiltered = rows @ rows.transpose(0, 2, 1)
-        # The determinant as a sum of squares (Cauchy-Binet): needles seen end-on keep
-        # their digits.
+        # The determinant as a sum of squares (Cauchy-Binet) keeps the digits of needles
+        # that are seen end-on.
         cross = np.cross(rows[:, 0], rows[:, 1])
         unfiltered_determinant = (cross * cross).sum(1)
         trace = unfiltered[:, 0, 0] + unfiltered[:, 1, 1]

@@ -1,5 +1,5 @@
-"""Quantised pages as docs/format.md has them, gaussian by gaussian, without a thought
-for speed."""
+"""Quantised pages as docs/format.md defines them, one gaussian at a time, without
+regard to speed."""
 
 import itertools
 
@@ -10,7 +10,7 @@ RANGE_BYTES = (40, 48, 52, 60)
 
 
 def sh_bits(sh_degree, band):
-    """Bits of brightness, orange and green."""
+    """Return the bits of brightness, orange and green."""
     return {1: (7, 7, 7), 2: (7, 5, 4), 3: (5 if band == 1 else 6, 4, 3)}[sh_degree]
 
 
@@ -22,7 +22,7 @@ def channels_of(rgb):
 
 
 def bits_of(words):
-    """A string of bits, lowest first."""
+    """Return the lowest bits of a string of bits."""
     return "".join(f"{int(word):032b}"[::-1] for word in words)
 
 
@@ -31,8 +31,8 @@ def number(bits, first, count):
 
 
 def decode(page, offset, sh_degree, *, fused):
-    """Means, quats, scales, opacities, sh; with `fused`, products are not rounded
-    before they are added."""
+    """Return means, quats, scales, opacities and sh; if `fused`, products are not
+    rounded before they are added."""
     n, num_sh = int(offset[-1]), (sh_degree + 1) ** 2
 
     def sum_of(a, code, step):

@@ -1,4 +1,4 @@
-"""Every gaussian against every pixel, front to back, in float64."""
+"""Every gaussian is evaluated at every pixel, front to back, in float64."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ TRANSMITTANCE_MIN = 1e-4
 
 @dataclass(frozen=True)
 class Picture:
-    color: np.ndarray  # (H,W,3) background included
+    color: np.ndarray  # (H,W,3) with the background
     alpha: np.ndarray  # (H,W)
     depth: np.ndarray  # (H,W) expected depth, 0 where nothing is drawn
-    num_blended: np.ndarray  # (H,W) gaussians that contributed
-    is_stopped: np.ndarray  # (H,W) whether it takes no more gaussians
-    # (H,W) smallest relative distance of an alpha to 1/255 or of a transmittance to
-    # where a pixel stops, and of an unclamped alpha to 0.999: below a band, rounding
-    # may decide otherwise than float64 does.
+    num_blended: np.ndarray  # (H,W) number of gaussians that contributed
+    is_stopped: np.ndarray  # (H,W) whether the pixel has stopped
+    # (H,W) smallest relative distance of an alpha to 1/255, of a transmittance to the
+    # value at which a pixel stops, or of an unclamped alpha to 0.999. Within a band
+    # around 0, rounding may decide differently than float64.
     cutoff_distance: np.ndarray
     clamp_distance: np.ndarray
     contribution: np.ndarray  # (N,) sum of weights over all pixels
@@ -39,9 +39,9 @@ def rasterize(
     sh_degree=None,
     min_transmittance=None,
 ) -> Picture:
-    """Pixels stop before TRANSMITTANCE_MIN; behind the gaussian that leaves
-    `min_transmittance` if given, and what is left goes to what was blended.
-    """
+    """Pixels stop before TRANSMITTANCE_MIN. If `min_transmittance` is given, they stop
+    behind the gaussian that leaves less, and the remaining light is given to the
+    blended gaussians."""
     stop = TRANSMITTANCE_MIN if min_transmittance is None else min_transmittance
     projection = project(gaussians, camera, filter_px2=filter_px2)
     colors = reference_sh.color(
@@ -69,8 +69,8 @@ def rasterize(
             break
         a, b = projection.covariance_px2[i][0]
         dx, dy = x - projection.mean_px[i, 0], y - projection.mean_px[i, 1]
-        # A sum of squares (Cholesky), so that no needle's exponent turns positive by
-        # rounding.
+        # As a sum of squares (Cholesky), the exponent of a needle never becomes
+        # positive by rounding.
         along = dx * dx / a
         across = (a * dy - b * dx) ** 2 / (a * projection.determinant[i])
         falloff = opacities[i] * np.exp(-0.5 * (along + across))

@@ -1,5 +1,5 @@
-"""The same pictures as a chain of torch operations, so that autograd gives the
-gradients. All of float64."""
+"""The same pictures as a chain of torch operations in float64, so that autograd
+provides the gradients."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def _sh_basis(directions, degree):
 
 
 def project(means, quats, scales, sh, camera, filter_px2=0.0, plain_colors=False):
-    """(N,2) means in px; (N,4) covariance in px² as xx, xy, yy and its determinant;
-    depth, compensation (N,); colour (N,3)."""
+    """Return (N,2) means in px; (N,4) covariances in px² as xx, xy, yy and the
+    determinant; depths and compensations (N,); colours (N,3)."""
     viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float64)
     rotate, eye = viewmat[:3, :3], torch.as_tensor(camera.position, dtype=torch.float64)
     view = means @ rotate.T + viewmat[:3, 3]
@@ -70,7 +70,7 @@ def project(means, quats, scales, sh, camera, filter_px2=0.0, plain_colors=False
             focal / depth[:, None] * (toward_view[:, axis] - bounded[:, None] * toward_view[:, 2])
         )
     a, b, c = ((rows[i] * rows[j]).sum(1) for i, j in ((0, 0), (0, 1), (1, 1)))
-    # As sums of positive terms: needles keep their digits.
+    # Sums of positive terms keep the digits of needles.
     normal = torch.linalg.cross(*rows)
     sharp = (normal * normal).sum(1)
     blurred = sharp + filter_px2 * (a + c) + filter_px2**2
@@ -102,8 +102,8 @@ def rasterize(
     antialiased=False,
     plain_colors=False,
 ):
-    """Colour (H,W,3), alpha (H,W), expected depth (H,W); differentiable in the first
-    six."""
+    """Return colour (H,W,3), alpha (H,W) and expected depth (H,W), differentiable by
+    the first six arguments."""
     image, covariance, depth, compensation, colors = project(
         means, quats, scales, sh, camera, filter_px2, plain_colors
     )

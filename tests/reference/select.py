@@ -8,14 +8,14 @@ import numpy as np
 
 
 def footprint_px2(ball: np.ndarray, eye: np.ndarray, focal_px2: float) -> float:
-    """Area on the screen of the solid angle under which a ball is seen; infinite from
-    within."""
+    """Return the area on the screen of the solid angle of a ball; it is infinite from
+    inside."""
     center, radius = np.float64(ball[:3]), float(ball[3])
     distance = float(np.linalg.norm(center - eye))
     if distance <= radius:
         return math.inf
-    # 2 pi (1 - cos a), written with sin^2 because 1 - cos loses all digits for far
-    # balls.
+    # This is 2 pi (1 - cos a), written with sin^2 because 1 - cos loses all digits for
+    # far balls.
     return 4 * math.pi * math.sin(0.5 * math.asin(radius / distance)) ** 2 * focal_px2
 
 
@@ -31,7 +31,8 @@ def eye_in_instance(scene, i: int, camera) -> np.ndarray:
 
 
 def metrics(scene, i: int, camera, footprint: str = "solid_angle") -> list[float]:
-    """Metric of each group, px²: screen area that one of its gaussians stands for."""
+    """Return the metric of each group in px²: the area on the screen that one of its
+    gaussians represents."""
     groups = scene.bundles[scene.instance_bundle[i]].groups
     eye = eye_in_instance(scene, i, camera)
     forward = scene.rotations[i].T @ camera.viewmat[2, :3]
@@ -46,8 +47,8 @@ def metrics(scene, i: int, camera, footprint: str = "solid_angle") -> list[float
 
 
 def cut(scene, camera, tolerance: float, footprint: str = "solid_angle") -> list[tuple[int, int]]:
-    """(instance, cluster) pairs whose own group fits and whose parent group does
-    not."""
+    """Return the (instance, cluster) pairs whose own group fits and whose parent group
+    does not."""
     pairs = []
     for i in range(len(scene)):
         clusters = scene.bundles[scene.instance_bundle[i]].clusters
@@ -63,8 +64,8 @@ def cut(scene, camera, tolerance: float, footprint: str = "solid_angle") -> list
 
 
 def paths(clusters, groups) -> list[list[int]]:
-    """Every path from a leaf to a root, as clusters; it takes one of those that a group
-    has made."""
+    """Yield every path from a leaf to a root as clusters; it passes through one of the
+    clusters that a group made."""
     made = {}
     for c, own in enumerate(clusters.own_group):
         made.setdefault(int(own), []).append(c)

@@ -14,8 +14,8 @@ from numpy.polynomial.legendre import Legendre
 
 
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """(N,(degree+1)²) basis values for directions (N,3) of any length; a zero direction
-    has only degree 0."""
+    """Return (N,(degree+1)²) values of the basis for directions (N,3) of any length;
+    for a zero direction, only degree 0 is not 0."""
     directions = np.asarray(directions, np.float64)
     length = np.linalg.norm(directions, axis=1, keepdims=True)
     x, y, z = (directions / np.where(length == 0, 1, length)).T
@@ -37,8 +37,8 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def color(sh: np.ndarray, directions: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """(N,3) colour: the series of sh (N,K,3) up to the degree, plus one half, clamped
-    at 0 from below.
+    """Return (N,3) colours: the series of sh (N,K,3) up to the degree, plus one half,
+    at least 0. Values that are not finite become 0.
 
     What is not finite is 0.
     """

@@ -1,5 +1,5 @@
-"""Starts of coarser clusters in float64: which gaussians survive pruning, and what a
-pair merges into."""
+"""The gaussians at which fits of coarser clusters start, in float64: the survivors of
+pruning, and merged pairs."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import numpy as np
 
 from reference import project as reference_project
 
-# Y_00: what turns the first SH coefficient into a colour.
+# Y_00 converts the first SH coefficient to a colour.
 CONSTANT_BASIS = 0.5 / np.sqrt(np.pi)
-# How much a difference in colour counts against one of the spacing of what is left.
+# The weight of a difference in colour relative to a distance in units of the spacing of
+# the remaining gaussians.
 COLOR_WEIGHT = 6.0
 
 
 def survivors(gaussians, wanted: int) -> list[int]:
-    """V3DG, section 3.2, as its published code has it: of each octant around the
-    medians its share, those of highest opacity and size."""
+    """V3DG, section 3.2, as in its published code: from each octant around the medians
+    survives its share, the gaussians with the highest opacity and size."""
     count = len(gaussians)
     scales = gaussians.scales.astype(np.float64)
     score = gaussians.opacities * np.prod(scales, axis=1) ** (2 / 3)
@@ -36,8 +37,8 @@ def survivors(gaussians, wanted: int) -> list[int]:
 
 
 def area(scales) -> np.ndarray:
-    """Surface of an ellipsoid over 4 pi: the mean of its shadow along 13 directions,
-    weighted by kind."""
+    """Return the surface area of an ellipsoid divided by 4 pi: the mean area of its
+    shadow along 13 directions, weighted by kind."""
     directions = [d for d in itertools.product([-1, 0, 1], repeat=3) if d > (0, 0, 0)]
     weights = {1: 0.0604247, 2: 0.1013528 / 2, 3: 0.5029995 / 4}
     a, b, c = np.moveaxis(np.asarray(scales, np.float64), -1, 0)
@@ -58,8 +59,8 @@ def covariances(gaussians) -> np.ndarray:
 
 
 def moments(gaussians) -> SimpleNamespace:
-    """Sums over gaussians of 1, place, its square with the shape, and SH, weighted by
-    opacity times area."""
+    """Return sums over gaussians of 1, the mean, its square plus the covariance, and
+    SH, weighted by opacity times area."""
     weight = gaussians.opacities * area(gaussians.scales)
     means = gaussians.means.astype(np.float64)
     second = covariances(gaussians) + means[:, :, None] * means[:, None, :]
@@ -72,8 +73,8 @@ def moments(gaussians) -> SimpleNamespace:
 
 
 def merged(gaussians) -> SimpleNamespace:
-    """One gaussian with the moments of all, opaque enough to keep their area times
-    opacity."""
+    """Return one gaussian with the moments of all, so opaque that it keeps their area
+    times opacity."""
     m = moments(gaussians)
     mean = m.mean / m.weight
     covariance = m.second / m.weight - np.outer(mean, mean)
@@ -87,7 +88,7 @@ def merged(gaussians) -> SimpleNamespace:
 
 
 def cheapest_pair(gaussians) -> tuple[int, int]:
-    """The pair that a merge to one gaussian less joins."""
+    """Return the pair that is joined if one gaussian must be merged."""
     count = len(gaussians)
     weight = gaussians.opacities * area(gaussians.scales)
     means = gaussians.means.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Small places that surround who sees them."""
+"""Small places that surround the viewer."""
 
 import numpy as np
 
@@ -6,7 +6,8 @@ import v3dg
 
 
 def box(rng, low, high, density=100.0, sides="xXyYzZ"):
-    """Points on sides of a box, evenly: x is the low one across x, X the high one."""
+    """Return points that are evenly distributed on sides of a box: x is the low side
+    across the x axis, X the high one."""
     borders = np.array([low, high], float)
     points = []
     for side in sides:
@@ -32,7 +33,7 @@ def asset_of(points, scale=0.06):
 
 
 def room(density=25.0):
-    """Walls, a table and a cupboard; -y is up."""
+    """Return walls, a table and a cupboard; -y is up."""
     rng = np.random.default_rng(0)
     walls = box(rng, (-3, -2.6, -2), (3, 0, 2), density)
     table = box(rng, (-0.8, -0.8, -0.5), (0.8, -0.7, 0.5), 4 * density)
@@ -41,7 +42,7 @@ def room(density=25.0):
 
 
 def house(density=25.0):
-    """A room in a garden of twice its area."""
+    """Return a room in a garden of twice its area."""
     rng = np.random.default_rng(1)
     garden = box(rng, (-4, 0, -4), (4, 0.05, 4), density, sides="y")
     rooms = room(density).means.astype(float)
@@ -49,7 +50,7 @@ def house(density=25.0):
 
 
 def street(density=12.0):
-    """Two rows of houses with stalls between them, open above and at its ends."""
+    """Return two rows of houses with stalls in between, open above and at the ends."""
     rng = np.random.default_rng(2)
     points = [box(rng, (0, 0, -4), (30, 0.05, 4), density, sides="y")]
     for side in (-1, 1):

@@ -1,4 +1,4 @@
-"""Whole builds: what a bundle is made of, and how well its levels look."""
+"""Whole builds: the content of a bundle, and the quality of its levels."""
 
 import hashlib
 import itertools
@@ -57,7 +57,7 @@ def bundle(asset, device):
 
 
 def everything_in(bundle):
-    """All arrays of a bundle by name."""
+    """Return all arrays of a bundle by name."""
     arrays = {
         f"{t}.{n}": getattr(getattr(bundle, t), n) for t in TABLES for n in vars(getattr(bundle, t))
     }
@@ -70,14 +70,16 @@ def same(bundle, other):
 
 
 def ball_around(gaussians):
-    """Centre and radius of a ball that holds all that is drawn, and is not empty."""
+    """Return the centre and the radius of a ball, not empty, that contains everything
+    that is drawn."""
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     radius = float(np.linalg.norm(high - low)) / 2 + 3 * float(gaussians.scales.max())
     return (low + high).astype(np.float64) / 2, radius or 1.0
 
 
 def camera_at(center, radius, direction, footprint_px2):
-    """From four radii away, the ball covering about so many px²."""
+    """Return a camera four radii away for which the ball covers about this area in
+    px²."""
     side = max(4, math.ceil(2.2 * math.sqrt(footprint_px2 / math.pi)))
     fov = 2 * math.atan(1.1 * math.tan(math.asin(1 / 4)))
     eye = center + 4 * radius * np.asarray(direction) / np.linalg.norm(direction)
@@ -87,7 +89,8 @@ def camera_at(center, radius, direction, footprint_px2):
 
 
 def held_out_psnr(asset, bundle, level):
-    """PSNR of a level, drawn as large as it is selected, to the supersampled asset."""
+    """Return the PSNR of a level, drawn as large as it is selected, relative to the
+    supersampled asset."""
     gaussians, (center, radius) = bundle.level_gaussians(level), ball_around(asset)
     first = bundle.level_range(level).start
     options = {
@@ -169,8 +172,8 @@ def test_asset_may_be_on_the_device(asset):
 
 @pytest.mark.gpu
 def test_gpu_memory_that_is_taken_changes_no_byte():
-    """Groups whose pictures do not fit in memory together are fitted in turn, to the
-    same."""
+    """Groups whose pictures do not fit in memory together are fitted one after another,
+    with the same results."""
     import torch
 
     asset, config = make_asset(num_gaussians=60_000, seed=0), BuildConfig(cluster_size=32, steps=8)
@@ -225,8 +228,8 @@ def test_the_last_level_has_the_filter_of_a_pixel(filter_px2, last):
 
 
 def shell(width, height, seed=0):
-    """A ball of flat gaussians: their width and height, in distances to the next
-    one."""
+    """Return a ball of flat gaussians with this width and height, in distances to the
+    nearest neighbour."""
     rng, num = np.random.default_rng(seed), 1500
     quats = rng.normal(size=(num, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -241,8 +244,8 @@ SMOOTH = BuildConfig(cluster_size=64, steps=40, num_views=16)
 
 
 def growth_of_level_1(smooth, plain):
-    """(G,) times that balls of level 1 of a smooth asset are larger; those above
-    contain them."""
+    """Return (G,) the factors by which balls of level 1 of a smooth asset are larger;
+    the balls above contain them."""
     is_first, ball, other = smooth.groups.level == 1, smooth.groups.ball, plain.groups.ball
     np.testing.assert_array_equal(ball[is_first, :3], other[is_first, :3])
     for lower, upper in enumerate(smooth.groups.parent):
@@ -326,8 +329,8 @@ def test_smoothness_is_measured_where_levels_are_fitted_with_a_filter(changes, i
 @pytest.mark.parametrize("num_gaussians", [8192, 8193, 8200, 9000, 700])
 @pytest.mark.parametrize(("missed", "is_smooth"), [(1.47, True), (1.48, False)])
 def test_smoothness_is_measured_all_over_the_asset(num_gaussians, missed, is_smooth, monkeypatch):
-    """Also where groups have a gaussian more than a round number: a sample's clusters
-    could be larger."""
+    """This also holds if groups have one gaussian more than a round number; the
+    clusters of a sample could be larger."""
     asset = make_asset(num_gaussians=1000, seed=0).subset(np.arange(num_gaussians) % 1000)
     config = BuildConfig(cluster_size=64, group_size=4, steps=7, loss_l1=2.0, loss_alpha=0.25)
     leaves = MemoryLeaves(asset, config)
@@ -387,8 +390,8 @@ def test_neighbours_stand_together_in_the_clusters_of_every_level(config, codec,
 
 
 def test_the_filter_of_an_asset_is_its_own(asset, bundle, device):
-    """Level 0 is drawn with it; what is coarser is fitted to the asset without, or
-    would be thicker."""
+    """Level 0 is drawn with it. Coarser levels are fitted to the asset without a
+    filter; otherwise they would be thicker."""
     filtered = build(asset, replace(SMALL, asset_filter_px2=0.3), device=device)
     is_fine = bundle.clusters.level == 0
     assert (filtered.clusters.filter_px2[is_fine] == np.float32(0.3)).all()
@@ -423,7 +426,7 @@ def test_boxes_hold_all_that_is_drawn(asset, moved, device):
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # Where alpha falls to 1/255.
+    # At this distance, alpha is 1/255.
     sigmas = np.sqrt(2 * np.log(np.maximum(255 * g.opacities.astype(np.float64), 1)))
     axes = reference_project.rotation(g.quats) * (g.scales * sigmas[:, None])[:, None, :]
     points = g.means[:, None, :] + directions @ axes.transpose(0, 2, 1)
@@ -442,8 +445,8 @@ def test_colours_of_all_degrees_survive_to_the_coarsest_level(degree, device):
     bundle = build(asset, replace(SMALL, steps=0), device=device)
     last = bundle.level_gaussians(bundle.num_levels - 1)
     np.testing.assert_allclose(last.sh, asset.sh[: len(last)], rtol=1e-5, atol=1e-6)
-    # Fitting makes up for lost overlap with brightness, but has no reason to turn what
-    # the view changes.
+    # The fit compensates for lost overlap with brightness, but has no reason to change
+    # coefficients that depend on the direction.
     fitted = build(asset, device=device)
     assert fitted.sh_degree == degree
     fitted_last = fitted.level_gaussians(fitted.num_levels - 1)
@@ -631,8 +634,8 @@ def test_wrong_settings_are_named(changes, message):
 
 
 def number_of(field):
-    """The annotation of a setting that is a number in a range, also of an optional
-    one; None for others."""
+    """Return the annotation of a setting that is a number in a range, also if it is
+    optional; None for other settings."""
     for kind in (field.type, *get_args(field.type)):
         if get_origin(kind) is Annotated:
             return kind
@@ -640,10 +643,10 @@ def number_of(field):
 
 
 def test_every_number_has_a_range_in_which_a_build_ends(asset):
-    """At either end of each, with the rest as it is: built, or refused before anything
-    is allocated."""
+    """Each setting takes either end of its range, with defaults for the rest: the asset
+    is built, or the settings are refused before memory is allocated."""
     small = BuildConfig(cluster_size=32, steps=1, num_views=2, asset_filter_px2=0.0)
-    # Without a range.
+    # Settings without a range.
     assert not {field.name for field in fields(BuildConfig) if field.type in (int, float)}
     numbers = {field.name: number_of(field) for field in fields(BuildConfig)}
     ranges = {name: get_args(kind)[1] for name, kind in numbers.items() if kind is not None}
@@ -686,7 +689,7 @@ def test_wrong_options_are_named(asset):
 def test_paper_settings_build(asset, group_size, changes, device):
     config = BuildConfig.paper(cluster_size=1200 // 16, group_size=group_size, steps=2, **changes)
     bundle = build(asset, config, device=device)
-    # Down to two clusters, in place of a root.
+    # The coarsest level has two clusters instead of one.
     clusters = [len(bundle.level_range(level)) for level in range(bundle.num_levels)]
     assert clusters == [16, 8, 4, 2]
     assert bundle.config["build"]["group_size"] == group_size
@@ -714,8 +717,8 @@ def test_paper_fit_reduces_the_error(asset, device):
 def test_fit_is_never_worse_than_its_start(asset, device):
     config = replace(SMALL, num_views=16)
     start = build(asset, replace(config, steps=0), device=device).groups
-    # Steps so long that fits run away; those of the first level have the same start in
-    # all.
+    # The steps are so long that fits diverge. The fits of the first level have the same
+    # start in all builds.
     for change in (
         {},
         {"step_position": 10.0, "step_logit": 50.0},
@@ -742,8 +745,8 @@ def test_runaway_fit_leaves_the_start(asset, device):
 
 
 def test_fit_gains_over_merging_alone(asset, device):
-    """In dB, at the size of selection, on views that no fit saw. Measured: 1.5, 1.5,
-    0.7."""
+    """The gain is in dB at the size of selection, in views that no fit saw. Measured:
+    1.5, 1.5, 0.7."""
     merged, fitted = (
         build(asset, BuildConfig(cluster_size=64, steps=steps), device=device) for steps in (0, 200)
     )
@@ -755,7 +758,8 @@ def test_fit_gains_over_merging_alone(asset, device):
 
 
 def test_progress_counts_all_levels_ahead(asset, device):
-    """It ends complete: all coarser gaussians, all levels, the last group, its loss."""
+    """At the end the progress is complete: all coarser gaussians, all levels, the last
+    group and its loss."""
     told = []
     config = replace(SMALL, group_size=4)
     bundle = build_bundle(

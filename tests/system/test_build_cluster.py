@@ -38,7 +38,8 @@ def folder(tmp_path_factory):
 
 @contextmanager
 def small_units():
-    """For the driver alone: workers get the plan of their unit with it."""
+    """Set the size of units in the driver only: workers receive it in the plan of their
+    unit."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("v3dg.levels.whole.UNIT_LEAVES", 500)
         yield
@@ -60,7 +61,7 @@ def spawned_processes(count):
 
 @pytest.fixture
 def at_package(monkeypatch):
-    """Processes that are spawned find the package under test."""
+    """Make spawned processes find the package under test."""
     monkeypatch.setenv("PYTHONPATH", PACKAGE)
 
 
@@ -104,7 +105,7 @@ def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, a
 
 
 def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch):
-    """Where one process was interrupted."""
+    """The build continues where one process was interrupted."""
     output = tmp_path / "out.v3dg"
     left = [8]
     simplify = v3dg.levels.simplify.LevelBuilder._simplify
@@ -155,7 +156,7 @@ def test_workers_that_do_not_reach_the_folder_say_so(folder, tmp_path, at_packag
 
 
 class Interrupted(Executor):
-    """Does two units, takes three more, and is interrupted."""
+    """Finishes two units, accepts three more, and is interrupted."""
 
     def __init__(self):
         self.futures = []
@@ -186,13 +187,13 @@ def test_an_interrupt_cancels_what_waits(folder, tmp_path):
 
 
 def is_journal_longer(output, folder):
-    """Whether a unit is finished."""
+    """Return whether a unit is finished."""
     path = levels_path(output)
     return path.exists() and path.stat().st_size > (folder / "local.v3dg").stat().st_size
 
 
 class Killer:
-    """Kills the process whose number a function gives, as soon as it gives one."""
+    """Kills the process whose number a function returns, as soon as it returns one."""
 
     def __init__(self, victim):
         self.killed = None
@@ -218,7 +219,7 @@ class Killer:
 
 @contextmanager
 def cluster(folder, num_workers):
-    """The address of a scheduler, and of workers that are processes of their own."""
+    """The address of a scheduler, and of workers in separate processes."""
     environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1", "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "0"}
     options = {
         "cwd": folder,
@@ -281,7 +282,7 @@ def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, 
         pids = client.run(os.getpid)
 
         def busy():
-            """A worker in the midst of a unit, when another unit is finished."""
+            """Return a worker that builds a unit while another unit is finished."""
             if not is_journal_longer(output, folder):
                 return None
             return next(
@@ -292,7 +293,7 @@ def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, 
             build_on(client.get_executor(), folder, output)
         assert killer.killed in pids.values()
         assert len(client.scheduler_info()["workers"]) == 3
-        # And by the command, which gets whole units.
+        # The command submits whole units, too.
         address = client.scheduler.address
         for name, options in (("dask", ["--scheduler", address]), ("here", [])):
             done = run(
@@ -318,7 +319,7 @@ class Meddler(threading.Thread):
 
 @pytest.fixture
 def meddled_build(folder, tmp_path):
-    """Builds on a cluster to whose scheduler something is done in the midst; also gives
+    """Build on a cluster to whose scheduler something is done meanwhile; return also
     its address."""
     distributed = pytest.importorskip("distributed")
     (tmp_path / "dask").mkdir()
@@ -336,11 +337,11 @@ def meddled_build(folder, tmp_path):
         yield build, output, address
         begin = time.monotonic()
         client.close()
-        assert time.monotonic() - begin < 30  # also with a scheduler that says nothing
+        assert time.monotonic() - begin < 30  # also with a scheduler that does not answer
 
 
 def goes_on_alone(folder, output):
-    """Whether finished units are there, from which a build goes on without the
+    """Return whether finished units exist, from which a build continues without the
     scheduler."""
     assert levels_path(output).exists()
     with ThreadPoolExecutor(2) as executor:
@@ -411,7 +412,8 @@ class Client:
 
 
 def test_only_silence_without_a_break_ends_a_wait():
-    """Of a scheduler that answers every tenth question, say, no matter for how long."""
+    """If a scheduler answers, for example, every tenth request, the build waits for any
+    length of time."""
     client = Client([number % 10 == 9 for number in range(40)] + [False] * 100)
     try:
         watch = scheduler.Watch(client)
@@ -433,7 +435,7 @@ def test_only_silence_without_a_break_ends_a_wait():
 
 @contextmanager
 def serving(answer):
-    """The address of something that says this to whoever connects."""
+    """Yield the address of a server that sends this to every client."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve():
@@ -492,7 +494,7 @@ def test_what_is_no_address_is_told_so(address):
 
 
 def test_a_lost_scheduler_ends_a_run_over_many_assets(tmp_path, monkeypatch):
-    """Each of the others would wait for it as long."""
+    """Otherwise each of the other assets would wait as long for it."""
     from v3dg.cli import main
 
     built = []

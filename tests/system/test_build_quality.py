@@ -1,5 +1,5 @@
-"""Builds that end with a refinement: which one, what stays, and what an interrupted one
-leaves."""
+"""Builds that end with a refinement: when they do, what stays unchanged, and what an
+interrupted refinement leaves."""
 
 import os
 import re
@@ -49,7 +49,7 @@ def asset():
 
 @pytest.fixture
 def short(monkeypatch):
-    """Refinements of few pictures."""
+    """Make refinements use few pictures."""
     monkeypatch.setattr("v3dg.levels.quality._LEAST_PICTURES", STEPS)
     monkeypatch.setattr("v3dg.levels.quality._GAUSSIANS_PER_PICTURE", 1 << 40)
     monkeypatch.setattr("v3dg.levels.refined._NUM_WEIGHING_PICTURES", 40)
@@ -113,7 +113,7 @@ def test_level_0_stays(short, asset, device):
 
 
 def test_workers_do_not_change_the_bytes(short, file, device, tmp_path, monkeypatch):
-    """Neither their number, nor whether the levels are in a file."""
+    """Neither their number nor storing the levels in a file changes the bytes."""
     monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 300)
     expected = bytes_of(refined_by_hand(file, device), tmp_path)
     output = tmp_path / "out.v3dg"
@@ -214,7 +214,7 @@ def is_bundle(path):
 
 
 def test_levels_at_a_path_stay_as_they_are_built(short, asset, device, tmp_path):
-    """So that a build of another quality continues from them."""
+    """A build with another quality then continues from them."""
     levels = tmp_path / "levels"
     options = {"config": QUICK, "device": device, "progress": False, "resume_path": levels}
     bundle = build_bundle(asset, quality="standard", **options)
@@ -267,8 +267,7 @@ def test_a_wrong_quality_is_refused(asset):
 
 
 class SmallGpu:
-    """A device that says that it is a GPU, for choices that are made before it is
-    used."""
+    """A device that claims to be a GPU, for choices that are made before it is used."""
 
     is_cuda = True
 
@@ -287,7 +286,8 @@ class SmallGpu:
 def test_a_build_is_refined_by_default_where_that_is_quick(
     monkeypatch, config, is_gpu, num_gaussians, memory, expected
 ):
-    """On a GPU with room for it; large assets say why they are not."""
+    """This holds on a GPU with enough memory. For large assets, the reason is printed
+    why they are not refined."""
     monkeypatch.setattr("v3dg.levels.default_quality.free_on", lambda _: 1 << 30)
     device = SmallGpu() if is_gpu else CPU
     leaves = SimpleNamespace(num_gaussians=num_gaussians, sh_degree=0)
@@ -322,7 +322,7 @@ def test_viewpoints_of_a_draft_are_refused(asset):
 def test_a_build_of_a_room_says_from_where_it_is_seen(
     short, tmp_path, monkeypatch, capsys, seen_from
 ):
-    """And is kept when it goes on."""
+    """The viewpoints are kept if the build continues."""
     monkeypatch.setattr("v3dg.cli.build.BuildConfig", lambda: QUICK)
     file = tmp_path / "room.ply"
     v3dg.write_asset(file, room())
@@ -341,8 +341,8 @@ def test_a_build_of_a_room_says_from_where_it_is_seen(
 
 
 def test_the_command_builds_each_quality(short, file, tmp_path, capsys):
-    """And says of a draft that nobody asked for which command refines it, and how long
-    that takes."""
+    """For a draft that nobody requested, it prints the command that refines it, and how
+    long that takes."""
     output = tmp_path / "a scene.v3dg"
     for quality in (None, "draft", "standard"):
         command.run(

@@ -1,5 +1,5 @@
-"""Builds that are interrupted, killed, gone on with; and the unfinished bundles that
-they leave."""
+"""Builds that are interrupted or killed and then continue, and the unfinished bundles
+that they leave."""
 
 import errno
 import hashlib
@@ -27,7 +27,7 @@ from v3dg.levels.digest import digest_of
 from v3dg.levels.unfinished import _open_locked
 
 CONFIG = BuildConfig(cluster_size=32, steps=400, first_steps=400)
-# Runs for days; only the first level's checkpoint would end it.
+# This build would run for days; only the checkpoint of the first level could end it.
 ENDLESS = replace(CONFIG, steps=1_000_000, first_steps=1_000_000)
 SCRIPT = """
 import sys
@@ -48,9 +48,9 @@ except KeyboardInterrupt:
     sys.exit(130)
 bundle.write(sys.argv[3])
 """
-# Bytes of the journal with less than which only leaves may be finished.
+# With fewer bytes in the journal, only leaves may be finished.
 TWO_RECORDS = 3700
-# Generous: a build that did not listen would take days.
+# This is generous: a build that ignored the interrupt would take days.
 PATIENCE = 60
 
 
@@ -76,7 +76,8 @@ def whole(asset, device, tmp_path_factory):
 
 @contextmanager
 def started_build(config, device, folder):
-    """A build in a process of its own; killed at the end if it still runs."""
+    """Start a build in a separate process, which is killed at the end if it still
+    runs."""
     roots = os.pathsep.join(
         str(Path(file).parents[1]) for file in (v3dg.__file__, Path(__file__).parent)
     )
@@ -88,7 +89,7 @@ def started_build(config, device, folder):
         env=environment,
         stdout=subprocess.PIPE,
         text=True,
-        # As from a terminal, whatever the tests themselves were started with.
+        # The same settings as from a terminal, however the tests were started.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     try:
@@ -101,8 +102,8 @@ def started_build(config, device, folder):
 
 
 def wait_for_growth(path, process, before=0):
-    """Until `path` has more than `before` bytes; how many, or None if the process ended
-    first."""
+    """Wait until `path` has more than `before` bytes; return their number, or None if
+    the process ended first."""
     while process.poll() is None:
         if path.exists() and (now := path.stat().st_size) > before:
             return now
@@ -168,7 +169,7 @@ QUICK = BuildConfig(cluster_size=64, steps=0)
 
 @pytest.fixture
 def checkpoint(asset, tmp_path, monkeypatch):
-    """All levels of a build that was interrupted before it could put them together."""
+    """All levels of a build that was interrupted before it could join them."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -219,7 +220,7 @@ FINISHING = {
 def test_a_kill_while_it_becomes_a_bundle_loses_nothing(
     asset, checkpoint, expected, place, moment, monkeypatch
 ):
-    """Before or after any of the steps; nothing is built again."""
+    """It is killed before or after any of the steps, and nothing is built again."""
     target, calls = FINISHING[place]
     *_, name = target.split(".")
     original = {
@@ -282,8 +283,8 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
     rng = np.random.default_rng(0)
     damaged = {"text": b"not levels", "zeros": bytes(1000), "archive": b"PK\x03\x04" + bytes(1000)}
     pages, journal = rng.integers(0, len(expected), 30), rng.integers(len(expected), len(good), 30)
-    # The first bytes, pages, the journal; at its end are mostly numbers of clusters and
-    # digests.
+    # The first bytes, pages, and the journal, whose end consists mainly of numbers of
+    # clusters and digests.
     for place in (
         *range(0, 42, 7),
         *pages,
@@ -300,7 +301,9 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
             build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
         except ValueError as error:
             refused.append(str(error))
-        else:  # one that makes a level look cut off, or is where the header and tables will be
+        # This size makes a level look truncated, or is at the place of the header and
+        # the tables.
+        else:
             assert checkpoint.read_bytes() == expected, damage
     assert len(refused) > len(damaged) / 2
     assert [
@@ -320,7 +323,7 @@ def test_resume_path_needs_a_folder(asset, tmp_path):
 
 
 def test_a_second_build_to_the_same_place_is_refused(asset, tmp_path):
-    """And the first goes on undisturbed."""
+    """The first build continues undisturbed."""
     with started_build(ENDLESS, "cpu", tmp_path) as process:
         wait_for_growth(tmp_path / "levels", process)
         for use in (
@@ -355,7 +358,8 @@ def test_the_digest_of_an_asset_is_the_one_of_the_format_page():
 
 @pytest.mark.parametrize("target", ["absent", "levels of another", "text"])
 def test_links_at_the_levels_are_refused(asset, checkpoint, tmp_path, target):
-    """Neither written through nor removed: what they lead to may be anyone's."""
+    """They are neither written through nor removed, because they may lead to
+    anything."""
     checkpoint.rename(tmp_path / "levels of another")
     (tmp_path / "text").write_bytes(b"")
     before = {name: (tmp_path / name).read_bytes() for name in names_in(tmp_path)}
@@ -377,8 +381,8 @@ def test_levels_are_for_their_owner_alone(checkpoint):
 
 
 def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
-    """A build that has opened the file of one that then ends and removes it would be
-    alone with its lock."""
+    """If a build ends and removes the file that another build has opened, the lock of
+    the latter would protect nothing."""
     path = tmp_path / "levels"
 
     def lock(descriptor, name):
@@ -408,8 +412,8 @@ def test_levels_that_a_kill_left_beside_a_bundle_are_removed(asset, tmp_path):
 
 
 def test_what_is_no_levels_stays(asset, tmp_path):
-    """A file of somebody that has the name of an unfinished bundle is neither removed
-    nor written to."""
+    """A user's file with the name of an unfinished bundle is neither removed nor
+    written to."""
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     (tmp_path / "out.v3dg.partial").write_text("a download that goes on")
     for resume in (False, True):
@@ -435,7 +439,7 @@ def test_a_bundle_that_was_not_moved_yet_is_discarded(asset, tmp_path):
 
 @contextmanager
 def files_of_at_most(num_bytes):
-    """Writing beyond fails, as on a full disk."""
+    """Make writes beyond this size fail, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
     try:
@@ -445,7 +449,7 @@ def files_of_at_most(num_bytes):
 
 
 def test_a_full_disk_leaves_what_can_be_gone_on_with(asset, checkpoint, expected):
-    """Or nothing, where no level was finished."""
+    """If no level was finished, nothing remains."""
     whole = checkpoint.read_bytes()
     journal = np.linspace(len(expected), len(whole) - 1, 5).astype(int)
     for num_bytes in (0, 10, 1000, len(expected) // 2, *journal):
@@ -475,8 +479,8 @@ def tiles(tmp_path_factory):
 
 @pytest.fixture
 def bounded(tiles, monkeypatch):
-    """Builds the tiles on the disk and in several units, as if they were many and
-    memory small."""
+    """Build the tiles on disk and in several units, as if they were many and memory
+    small."""
     monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 400)
     sizes = leaves_on_disk._Sizes(in_memory=0, in_block=1 << 16, in_node=700, in_bucket=300)
     monkeypatch.setattr(leaves_on_disk._Sizes, "of", lambda *_: sizes)
@@ -492,8 +496,8 @@ def bounded(tiles, monkeypatch):
 
 
 def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, monkeypatch):
-    """The first, the last and some between of each kind, of which half gets to the
-    disk."""
+    """The first write, the last write and some in between of each kind fail after half
+    of their bytes."""
     write, kinds = _files.write_at, []
     expected = bounded(tmp_path / "whole.v3dg")
 

@@ -21,7 +21,7 @@ from v3dg import cli
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with an asset, a bundle and a scene of three instances and two
+    """A folder with an asset, a bundle, and a scene of three instances and two
     cameras."""
     folder = tmp_path_factory.mktemp("cli")
     v3dg.write_asset(folder / "tuft.ply", make_asset(1000))
@@ -94,9 +94,9 @@ def test_completion_is_a_script_that_knows_commands_and_options(shell):
     assert done.returncode == 0, done.stderr
     assert "compare" in done.stdout
     assert "tolerance" in done.stdout
-    assert "Screen area" not in done.stdout  # help, which would flood the terminal
+    assert "Screen area" not in done.stdout  # help texts, which would flood the terminal
     assert "'None'" not in done.stdout
-    # Where nothing else fits, files are completed.
+    # If nothing else matches, file names are completed.
     files = {
         "bash": "complete -o default -F",
         "zsh": '-z "$completions"',
@@ -148,7 +148,7 @@ def test_bash_completes_what_the_script_says():
     assert done.stderr == ""
     *completed, registered = done.stdout.splitlines()
     assert completed == ["render", "--tolerance", "x y z -x -y -z", "0"]
-    # Else no file would be completed any more.
+    # Otherwise file names would no longer be completed.
     assert registered == "complete -o default -F _tyro_v3dg v3dg"
 
 
@@ -276,7 +276,7 @@ def test_build_refuses_an_asset_with_nothing_left(folder, tmp_path):
 
 
 def test_a_full_disk_is_named_with_what_resumes(folder, tmp_path):
-    """The first levels fit, the journal of all does not."""
+    """There is room for the first levels, but not for the journal of all levels."""
     limit = (folder / "tuft.v3dg").stat().st_size + 600
     done = subprocess.run(
         [*COMMAND, "build", folder / "tuft.ply", "-o", "out.v3dg", "--quiet"],
@@ -374,7 +374,8 @@ def test_render_from_a_pool(folder, tmp_path):
 
 
 def test_render_of_a_film_takes_a_budget_in_steps(folder, tmp_path):
-    """To where a part of it is free; a still takes all of it."""
+    """The film takes its budget from the part that is free; a still picture takes all
+    of it."""
     scene, cameras = v3dg.read_scene(folder / "scene.json")
     camera = cameras["near"]
     for fade, budget in ((1.0, 640), (1.02, 640 - 20)):
@@ -498,8 +499,8 @@ def test_wrong_usage(folder):
 @pytest.mark.parametrize("option", [("--views", 1), ("--elevation", 20), ("--up", "z")])
 @pytest.mark.parametrize("command", ["render scene.json", "compare tuft.ply scene.json"])
 def test_options_of_a_turntable_are_refused_beside_cameras(folder, option, command):
-    """Whatever their values: those that are the defaults say nothing of what was
-    given."""
+    """Their values do not matter, because a default does not show whether the option
+    was given."""
     message = (
         f"{option[0]}: expected a subject without cameras, got the cameras of scene.json; "
         "leave it out"
@@ -514,7 +515,8 @@ def test_options_of_a_turntable_are_refused_beside_a_camera_file(folder, tmp_pat
 
 
 def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
-    """Under any of its names: what an asset has besides its gaussians would be gone."""
+    """This holds for all its names: the content of an asset besides its gaussians would
+    be lost."""
     (tmp_path / "a.ply").write_bytes((folder / "tuft.ply").read_bytes())
     (tmp_path / "a.v3dg").write_bytes((folder / "tuft.v3dg").read_bytes())
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -532,8 +534,8 @@ def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
 
 
 def test_an_empty_argument_is_not_the_working_folder(folder):
-    """A shell gives one for a variable that is not set, and `build` would take all
-    assets that are there."""
+    """A shell passes an empty argument for an unset variable, and `build` would take
+    all assets in the working folder."""
     before = sorted(os.listdir(folder))
     fails(
         2,
@@ -604,8 +606,8 @@ def test_interrupt_leaves_no_bundle_and_says_so(tmp_path):
         stderr=subprocess.PIPE,
         text=True,
         env=ENVIRONMENT,
-        # Whoever starts the tests in the background has them ignore interrupts, and
-        # children inherit that.
+        # If the tests are started in the background, they ignore interrupts, and
+        # children inherit this.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     time.sleep(2.5)
@@ -638,14 +640,14 @@ def test_closed_and_full_streams_end_with_one_line_and_take_no_file(
     assert done.returncode in (0, 1)
     assert done.stderr.count("\n") <= 1
     assert done.stderr.startswith("v3dg: error: " if done.stderr else "")
-    for path in tmp_path.iterdir():  # all that is printed goes elsewhere
+    for path in tmp_path.iterdir():  # all output goes to another place
         np.testing.assert_array_equal(
             v3dg.read_asset(path).means, v3dg.read_asset(folder / "tuft.ply").means
         )
 
 
 def test_text_of_files_reaches_no_terminal_as_it_is(folder, tmp_path):
-    """Names of files, and what a bundle says of itself."""
+    """These are names of files, and texts in a bundle."""
     evil = "\x1b]0;owned\x07\x1b[2J\r\n\u202e\x9b\udcff"
     for name in ("{}.ply", "{}.v3dg"):
         shutil.copy(folder / name.format("tuft"), tmp_path / name.format(evil))

@@ -22,7 +22,7 @@ def tiny(seed=0):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Three assets, one of which cannot be read, and a file that is no asset."""
+    """Three assets, one of which cannot be read, and a file that is not an asset."""
     for name in ("a", "c"):
         v3dg.write_asset(tmp_path / f"{name}.ply", tiny(ord(name)))
     (tmp_path / "b.ply").write_bytes(b"ply\n")
@@ -86,8 +86,8 @@ def test_resume_keeps_what_is_done_with_these_settings(folder):
     assert statuses() == ["built", "built"]
     assert statuses() == ["kept", "kept"]
     assert statuses("--seed", 1) == ["built", "built"]
-    # Dates say nothing: these are other gaussians in files that are older than their
-    # bundles, and the same in files that are newer.
+    # Dates are not used: some files with other gaussians are older than their bundles,
+    # and some with the same are newer.
     (folder / "a.ply").rename(folder / "b.ply")
     (folder / "c.ply").rename(folder / "a.ply")
     (folder / "b.ply").rename(folder / "c.ply")
@@ -120,7 +120,7 @@ def lies(config):
         config | {"asset_digest": 0},
         config | {"build": []},
         config | {"seed": {}},
-        # As of earlier builds.
+        # These are left by earlier builds.
         {name: value for name, value in config.items() if name != "asset_digest"},
     ]
 
@@ -198,7 +198,7 @@ def test_errors_before_anything_is_built(folder):
 
 
 def test_several_files_make_one_asset(tmp_path):
-    """Whatever the memory, and whether they are named or their folder."""
+    """This holds with any memory, whether the files are named or their folder."""
     parts = [tiny(), tiny()]
     (tmp_path / "tiles").mkdir()
     for name, part in zip("ab", parts, strict=True):

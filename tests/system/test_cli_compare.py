@@ -19,7 +19,8 @@ from v3dg.pictures import read_picture, write_picture
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An asset, its bundle, and a scene of it with one near and one far camera."""
+    """An asset, its bundle, and a scene of the bundle with one near and one far
+    camera."""
     folder = tmp_path_factory.mktemp("compare")
     asset = make_asset(1000)
     v3dg.write_asset(folder / "tuft.ply", asset)
@@ -52,7 +53,7 @@ def test_an_asset_and_itself_are_equal(folder, tmp_path):
 
 
 def test_many_views_are_measured_by_several_processes_alike(folder, tmp_path):
-    """View 0 of a turntable is the same, however many there are; the others come in
+    """View 0 of a turntable is the same for any number of views; the others are in
     order."""
     options = ("--size", 64, 48, "-o", tmp_path / "c.png", "--tolerance", 100, "--views")
     one, many = (compare(folder, "tuft.ply", "tuft.v3dg", *options, n)["views"] for n in (1, 9))
@@ -204,7 +205,7 @@ def chunk(kind, data):
 
 
 def grey_png(side, *chunks, depth=8, rows=1):
-    """A grey PNG of any side with so few rows of data."""
+    """Return a grey PNG with any side that has only this number of rows."""
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, depth, 0, 0, 0, 0))
     data = zlib.compress(bytes((1 + side * depth // 8) * rows))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -254,7 +255,7 @@ def test_no_program_is_started_for_a_picture(tmp_path, monkeypatch):
 
 
 def test_more_pictures_in_a_file_are_not_looked_at(tmp_path):
-    """As in an animation, whose first picture is the one that is compared."""
+    """An animation has several pictures, of which the first is compared."""
     animated = grey_png(8, chunk(b"acTL", bytes(8)), rows=8)
     (tmp_path / "a.png").write_bytes(grey_png(8, rows=8))
     (tmp_path / "b.png").write_bytes(animated)

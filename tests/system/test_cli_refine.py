@@ -1,4 +1,4 @@
-"""`v3dg refine`."""
+"""The command `v3dg refine`."""
 
 import json
 
@@ -34,7 +34,8 @@ def test_a_bundle_is_refined(folder):
 
 
 def test_info_tells_how_levels_were_built_from_how_they_were_refined(folder):
-    """Also where a setting has the name and the default of one of the build."""
+    """This also holds if a setting has the name and the default of a setting of the
+    build."""
     bundle = v3dg.Bundle.open(folder / "donut.v3dg")
     about = {"refined": {"steps": v3dg.BuildConfig().steps, "drop": 0.1, "seed": 3}}
     config = bundle.config | about
@@ -57,7 +58,7 @@ def test_cameras_say_from_where(folder):
 
 
 def test_lens_distortion_is_left_out_if_told(folder):
-    """As most models of COLMAP have it."""
+    """Most models of COLMAP have such a lens."""
     document = json.loads((folder / "eyes.json").read_text())
     (folder / "bent.json").write_text(json.dumps(document | {"camera_model": "OPENCV", "k1": 0.1}))
     command = (
@@ -96,9 +97,7 @@ def test_what_cannot_be_meant_is_told(folder):
         "x.ply",
         cwd=folder,
     )
-    fails(
-        1, "a file ending in .v3dg, got another suffix", "refine", "donut.ply", "x.v3dg", cwd=folder
-    )
+    fails(1, "a file ending in .v3dg, got a .ply", "refine", "donut.ply", "x.v3dg", cwd=folder)
     fails(1, "Not a directory", "refine", "donut.v3dg", "donut.v3dg/x.v3dg", cwd=folder)
     fails(
         1,

@@ -1,4 +1,5 @@
-"""`v3dg render`: cameras without a file, backgrounds, films and panoramas."""
+"""The command `v3dg render`: cameras without a file, backgrounds, films and
+panoramas."""
 
 import dataclasses
 import itertools
@@ -28,7 +29,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def render(folder, tmp_path, monkeypatch, capsys):
-    """Runs the command beside the asset; its pictures go to another folder."""
+    """Run the command in the folder of the asset; its pictures go to another folder."""
     monkeypatch.chdir(folder)
 
     def run(*options, output="out.png"):
@@ -64,7 +65,7 @@ def test_an_eye_alone_looks_at_the_middle(render):
     assert render("--eye", 0, 0, 9, "--up", "y")[0] == 0
     _, _, path = render("--eye", 0, 0, 9, "--up", "y", "--fov", 20)
     rows, columns = np.nonzero(pixels(path).max(axis=2) > 30)
-    # The middle of the box, which the rows of a blob are not around exactly.
+    # This is the middle of the box, which is not exactly the middle of the blob's rows.
     assert abs(rows.mean() - 24) < 8
     assert abs(columns.mean() - 32) < 8
 

@@ -1,4 +1,4 @@
-"""`v3dg convert`: assets, levels and cuts as files of any format that is written."""
+"""`v3dg convert` writes assets, levels and cuts in every format that can be written."""
 
 import json
 import zipfile

@@ -1,4 +1,4 @@
-"""`v3dg convert` with edits: what is written, and what is said about it."""
+"""`v3dg convert` with edits: what is written, and what is reported about it."""
 
 import json
 

@@ -1,5 +1,5 @@
-"""Programs that end while their threads work, and those that start in odd interpreters
-and settings."""
+"""Programs that end while their threads work, and programs in unusual interpreters and
+settings."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)
 
 
 def run(code, *arguments, **environment):
-    """A Python that runs the code."""
+    """Run the code in a new Python process."""
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code), *arguments],
         env=ENVIRONMENT | environment,
@@ -169,7 +169,7 @@ def test_masks_of_modes_are_the_same_without_proc():
 
 
 def test_a_build_needs_no_proc(tmp_path):
-    """A folder without access in its place, in a namespace of mounts of its own."""
+    """A folder without access is mounted over it, in a separate mount namespace."""
     v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 500, 0))
     alone = ["unshare", "--mount", "--map-root-user"]
     if subprocess.run([*alone, "true"], capture_output=True, check=False).returncode != 0:

@@ -1,5 +1,5 @@
-"""The evaluation: its baselines, its measures, a small run of it, and the page that is
-made of that."""
+"""The evaluation: its baselines, its measures, a small run, and the page of its
+results."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_cut_of_the_hierarchy_has_one_node_above_every_leaf(asset, scene, target
         above += chosen[:, at]
         if (at == 0).all():
             break
-        # The root counts once, however long the path to it.
+        # The root counts once, however long the path to it is.
         above[:, at == 0] -= chosen[:, [0]]
         at = hierarchy.parent[at]
     assert (above == 1).all()
@@ -110,8 +110,8 @@ def test_hierarchy_keeps_moments_and_shares_axes(asset):
     assert ((mean >= low - 1e-6) & (mean <= high + 1e-6)).all()
     np.testing.assert_array_less(hierarchy.box[parent, 0], hierarchy.box[:, 0] + 1e-6)
     np.testing.assert_array_less(hierarchy.box[:, 1], hierarchy.box[parent, 1] + 1e-6)
-    # Axes are named alike: no turn of more than 63 degrees, the farthest from all 24
-    # that map axes to axes.
+    # The axes are named alike, so no rotation exceeds 63 degrees, the largest distance
+    # from all 24 rotations that map axes to axes.
     turn = np.abs((nodes.quats * nodes.quats[parent]).sum(axis=1)) / np.linalg.norm(
         nodes.quats[parent], axis=1
     )
@@ -179,8 +179,8 @@ def test_popping_is_what_a_frame_changes_beyond_the_truth():
 
 
 def frames_of(*changes):
-    """Grey pictures of 40 x 36 px, in which a tile at the right is lighter by so many
-    255ths."""
+    """Return grey pictures of 40 x 36 px, in which a tile at the right is brighter by
+    this number of 255ths."""
     pictures = []
     for change in changes:
         picture = np.full((36, 40, 3), 0.5, np.float32)
@@ -200,7 +200,7 @@ def test_worst_tile_is_what_its_error_changes_by():
     assert row["tile_median"] == pytest.approx(0.5, abs=1e-3)
     assert row["rms"] == pytest.approx((8 + 1) / 4 * math.sqrt(8 / 40 * 16 / 36), abs=1e-3)
     moving = steadiness.Steadiness()
-    for picture in frames_of(0, 0, 8, 8, 7):  # as the truth does
+    for picture in frames_of(0, 0, 8, 8, 7):  # as in the reference
         moving.add(picture, picture - np.float32(0.125))
     assert moving.row()["tile_worst"] < 1e-3
     assert moving.row()["psnr"] == pytest.approx(-20 * math.log10(0.125), abs=1e-3)
@@ -286,15 +286,15 @@ def test_crowds_stand_upright_and_windows_look_at_what_is_in_them(tmp_path, scen
 
 
 class Seen:
-    """What a picture of a wall has besides colours."""
+    """The data of a picture of a wall besides its colours."""
 
     def __init__(self, depth, alpha=1.0):
         self.depth, self.alpha = np.full((32, 48), depth), np.full((32, 48), alpha)
 
 
 def test_errors_are_followed_to_where_they_are_seen_next():
-    """A wall at depth 8, seen by cameras that are three pixels of it apart, or by one
-    as the wall moves."""
+    """The wall is at depth 8. The cameras are three of its pixels apart, or the wall
+    moves in front of one camera."""
     first = Camera(np.eye(4), np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32)
     aside = np.eye(4)
     aside[0, 3] = 3 * 8 / 40
@@ -379,7 +379,7 @@ def test_unknown_part_is_refused(capsys, tmp_path):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """All parts, as small as can be."""
+    """All parts, as small as possible."""
     folder = tmp_path_factory.mktemp("evaluation")
     made = evaluation.Evaluation(TINY, "cpu", folder)
     return folder, evaluation.run(made, "tiny", evaluation.NAMES, quiet=True)
@@ -421,7 +421,7 @@ def test_what_is_written_by_hand_stays_behind_a_new_page(tmp_path, monkeypatch):
     output = tmp_path / "results.md"
     output.write_text(f"# Results\n\nold\n\n{report.BY_HAND}\n\n## By hand\n", encoding="utf-8")
     options = report.Report((tmp_path,), output, tmp_path / "tables.md", no_plots=True)
-    for _ in range(2):  # again and again
+    for _ in range(2):  # repeated
         report.run(options)
         text = output.read_text(encoding="utf-8")
         assert text == f"# Results\n\nnew\n\n{report.BY_HAND}\n\n## By hand\n"

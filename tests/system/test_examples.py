@@ -1,4 +1,4 @@
-"""Examples run, small; what they need beyond the package is optional."""
+"""The examples run with small sizes. What they need beyond the package is optional."""
 
 import importlib.util
 import sys
@@ -21,14 +21,14 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def load_example(name):
     specification = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     module = importlib.util.module_from_spec(specification)
-    sys.modules[name] = module  # where dataclasses look for it
+    sys.modules[name] = module  # dataclasses look for it there
     specification.loader.exec_module(module)
     return module
 
 
 @pytest.fixture
 def film(tmp_path, device):
-    """Decoded pictures of a tiny film of falling donuts."""
+    """The decoded pictures of a tiny film of falling donuts."""
     av = pytest.importorskip("av")
     example = load_example("falling_donuts")
     path = tmp_path / "donuts.mp4"
@@ -93,7 +93,7 @@ def test_what_is_trained_looks_like_photographs_that_were_held_out(capture, devi
     path = capture / "trained.ply"
     few = {"start": 500, "sh_degree": 1, "device": device}
     before = example.main(example.Config(capture, path, steps=0, **few))
-    # As large as they are, and smaller.
+    # In their original size, and smaller.
     assert example.main(example.Config(capture, path, steps=40, **few)) > before + 3
     assert example.main(example.Config(capture, path, steps=40, longest=32, **few)) > before + 3
     num_points = 200 if (capture / "sparse").is_dir() else 500
@@ -113,7 +113,7 @@ def test_photographs_of_another_size_than_their_cameras_are_refused(capture):
 
 
 def sheet(z, size):
-    """Gaussians side by side across the z axis, opaque together."""
+    """Return gaussians side by side across the z axis that are opaque together."""
     x, y = np.meshgrid(np.linspace(-size, size, 12), np.linspace(-size, size, 12))
     count = x.size
     return v3dg.Gaussians(
@@ -127,8 +127,8 @@ def sheet(z, size):
 
 @pytest.mark.parametrize("turns", [1, 2])
 def test_what_no_camera_sees_is_dropped(tmp_path, turns):
-    """A wall ahead hides what is behind it; another wall is behind the camera, and seen
-    when it turns."""
+    """A wall in front hides what is behind it. Another wall is behind the camera, and
+    visible when the camera turns."""
     wall, hidden, behind = sheet(3, 6), sheet(9, 1), sheet(-3, 6)
     v3dg.write_asset(tmp_path / "scene.ply", v3dg.Gaussians.concatenate([hidden, wall, behind]))
     camera = v3dg.Camera.look_at(
@@ -151,7 +151,7 @@ def test_what_no_camera_sees_is_dropped(tmp_path, turns):
 
 
 def test_weights_are_those_of_the_picture(tmp_path):
-    """All weights together are the picture's alpha."""
+    """The sum of all weights is the alpha of the picture."""
     example = load_example("drop_unseen")
     camera = v3dg.Camera.look_at(
         (0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_x=1.2, width=64, height=48
@@ -175,8 +175,8 @@ def gsplat_example(tmp_path):
 
 
 def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
-    """What it hands over is all that a rasterizer needs: ours, which has gsplat's
-    meaning, draws it."""
+    """The arguments are everything that a rasterizer needs: ours, which interprets them
+    like gsplat, draws the picture."""
     example, config = gsplat_example
     scene, camera = example.make_scene(config)
     camera = v3dg.Camera(camera.viewmat, camera.K, camera.width, camera.height, near=0.02)
@@ -206,8 +206,8 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
     options = {"tolerance": config.tolerance, "min_transmittance": 0, "device": "cpu"}
     wanted = v3dg.render(scene, camera, **options)
     assert wanted.alpha.max() > 0.9
-    # Coarser levels have the filter of the arguments; what is left is rounding of the
-    # translation. Where gsplat's pixels stop, ours go on here.
+    # Coarser levels have the filter of the arguments; the rest is rounding of the
+    # translation. Where pixels of gsplat stop, ours continue here.
     go_on = wanted.alpha < 0.9999
     assert 0.5 < go_on.mean() < 1
     assert psnr(wanted.color[go_on][None], drawn.color.numpy()[go_on][None]) > 100

@@ -1,5 +1,5 @@
-"""Ctrl-C at the moments that are hard, and two builds to one place; fuzz/attack.py
-tries all others."""
+"""Ctrl-C at difficult moments, and two builds to one place; fuzz/attack.py tries all
+other moments."""
 
 import os
 import signal
@@ -41,8 +41,8 @@ def test_two_builds_to_one_path_do_not_disturb_each_other(tmp_path):
 
 
 def run_as_command(code, tmp_path, begin="_start.raise_interrupts()"):
-    """A Python that hears Ctrl-C as commands do, runs the code, and interrupts itself
-    in it."""
+    """Run code in a Python process that handles Ctrl-C like a command, and that
+    interrupts itself."""
     (tmp_path / "slow.py").write_text(
         "import os, signal; os.kill(os.getpid(), signal.SIGINT); done = sum(range(10**6))"
     )

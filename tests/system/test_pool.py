@@ -1,5 +1,5 @@
-"""Pools: pictures of scenes of which only a part is in memory, settled and not, and
-with faults."""
+"""Pools: pictures of scenes that are only partly in memory, settled or not, and with
+faults."""
 
 import itertools
 import os
@@ -32,7 +32,7 @@ FINE = {"tolerance": 0.5}
 
 @pytest.fixture
 def asset():
-    """Of SH degree 1, about 250 pages."""
+    """An asset of SH degree 1 with about 250 pages."""
     rng = np.random.default_rng(0)
     return lod_bundle(rng, blob(rng, 5000, sh_degree=1), 32)
 
@@ -45,8 +45,8 @@ def path(asset, tmp_path):
 
 @pytest.fixture(params=["mixed", "coded"])
 def scene(request, asset, path):
-    """Instances of files, each of another SH degree: of codes, or also of rows and of a
-    bundle in memory."""
+    """Return instances of files, each with another SH degree, as codes; or also as
+    rows, with a bundle in memory."""
     rng, scene = np.random.default_rng(1), Scene()
     is_coded = request.param == "coded"
     many = coded(asset, path.with_name("many.v3dg")) if is_coded else Bundle.open(path)
@@ -60,14 +60,14 @@ def scene(request, asset, path):
 
 
 def coded(bundle, path):
-    """The bundle as a file of codes."""
+    """Return the bundle as a file of codes."""
     Bundle(bundle.clusters, bundle.groups, bundle.gaussians, codec="quantized").write(path)
     return Bundle.open(path)
 
 
 def scaled(scene, memory):
-    """As many bytes for a scene of codes as are for one of rows: about as many
-    gaussians."""
+    """Return the bytes for a scene of codes that hold about as many gaussians as these
+    bytes for a scene of rows."""
     return (
         memory if any(bundle.codec == "float32" for bundle in scene.bundles) else int(0.3 * memory)
     )
@@ -105,7 +105,7 @@ def test_settled_picture_is_that_of_all_pages(scene, device, options):
 
 @pytest.mark.parametrize("memory", ["64MB", 500_000])
 def test_stills_are_settled(scene, device, memory):
-    """Also those that are looked at when the pages of other views are there."""
+    """This also holds if they are awaited when pages of other views are resident."""
     cameras = [CAMERA, NEAR, AWAY]
     if memory != "64MB":
         memory = scaled(scene, memory)
@@ -145,7 +145,7 @@ def status_after(renderer, camera, **options):
 
 
 def memory_for(scene, device, num_slots):
-    """Bytes of a pool with so many slots."""
+    """Return the bytes of a pool with this number of slots."""
     low, high = 1 << 10, 1 << 26
     while high - low > 64:
         middle = (low + high) // 2
@@ -190,7 +190,7 @@ def test_resident_gaussian_of_a_quantised_bundle_takes_its_code(tmp_path, device
         int(bundle.clusters.offset[page.stop] - bundle.clusters.offset[page.start]) for page in ends
     )
     few, many = (memory_for(bundle, device, count) for count in (100, 200))
-    of_gaussians = 7 / 8 * (many - few)  # the rest is for pages on their way
+    of_gaussians = 7 / 8 * (many - few)  # the rest is for pages that are being loaded
     assert 16 + 8 * sh_degree < of_gaussians / (100 * slot) <= most
 
 
@@ -199,7 +199,7 @@ def test_frames_become_finer_until_nothing_is_missing(scene, device):
     first = renderer.render(CAMERA, **FINE)
     assert first.color.shape == (61, 93, 3)
     missing, deadline = [], time.monotonic() + 60
-    # On a device, a picture tells what one before it missed.
+    # On a device, a picture reports what the picture before it missed.
     while (len(missing) < 4 or any(missing[-4:])) and time.monotonic() < deadline:
         missing.append(renderer.render(CAMERA, **FINE).stats.missing)
         time.sleep(0.01)
@@ -210,8 +210,8 @@ def test_frames_become_finer_until_nothing_is_missing(scene, device):
 
 @pytest.mark.parametrize(("memory", "most"), [("64MB", 1), ("8MB", 3), ("4MB", 5)])
 def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, most):
-    """No more than their bytes call for, of which an eighth of the pool is on the way
-    at once, and one more.
+    """The number is the number of bytes that are needed, divided by the eighth of the
+    pool that is loaded at once, plus one. Pages of all 13 levels are requested at once.
 
     Pages of all levels are asked for at once: there are 13 of them.
     """
@@ -246,8 +246,7 @@ def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_pages_are_there_together_with_those_above_them(scene, device, seed, monkeypatch):
-    """In every order of frames and of pages that have been read, with too little room
-    for most views."""
+    """Frames and reads are in every order, with too little room for most views."""
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     rng = np.random.default_rng(seed)
     renderer = Renderer(
@@ -272,12 +271,12 @@ def test_pages_are_there_together_with_those_above_them(scene, device, seed, mon
             (a & ~b).any() for a, b in zip(before, there, strict=True)
         )
         before = there
-    assert num_changes > 0  # pages left, too
+    assert num_changes > 0  # pages were also evicted
 
 
 def order_of_reading(scene, monkeypatch):
-    """(bundle, page) of what a picture misses, in the order in which it is read; a page
-    comes with each."""
+    """Return (bundle, page) for what a picture misses, in the order in which it is
+    read; one page arrives at a time."""
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     renderer = Renderer(scene, device="cpu", memory="64MB")
     renderer.render(CAMERA, **FINE)
@@ -296,13 +295,13 @@ def order_of_reading(scene, monkeypatch):
 
 
 def test_no_page_is_read_before_those_above_it(scene, monkeypatch):
-    """Each can be drawn from the next picture on."""
+    """Each page can be drawn from the next picture on."""
     assert len(order_of_reading(scene, monkeypatch)) > 100
 
 
 def test_neighbours_in_a_file_are_read_one_after_another(path, monkeypatch):
-    """Levels are as long as a stretch of 512 KiB or shorter, but the finest one, which
-    is longer."""
+    """Each level is at most as long as a read of 512 KiB, except for the finest level,
+    which is longer."""
     bundle = Bundle.open(path)
     scene = Scene()
     scene.add(bundle)
@@ -314,8 +313,8 @@ def test_neighbours_in_a_file_are_read_one_after_another(path, monkeypatch):
 
 
 def film_of_arriving_pages(scene, device, options, num_frames=150):
-    """Pictures of a camera at rest from the coarsest level on, and in how many frames
-    pages have faded in."""
+    """Return pictures of a camera at rest, from the coarsest level on, and the number
+    of frames in which pages fade in."""
     renderer, pictures, arrived = Renderer(scene, device=device, memory="64MB"), [], []
     for _ in range(num_frames):
         image = renderer.render(CAMERA, **options)
@@ -332,8 +331,8 @@ def film_of_arriving_pages(scene, device, options, num_frames=150):
 
 
 def worst_tile(pictures):
-    """Root mean square, in 255ths, of the tile that changes most from one picture to
-    the next."""
+    """Return the root mean square, in 255ths, of the tile that changes most between two
+    pictures."""
     changes = (np.square(255.0 * (b - a)).mean(-1) for a, b in itertools.pairwise(pictures))
     return max(np.sqrt(tile_means(change).max()) for change in changes)
 
@@ -365,7 +364,7 @@ def test_settling_ends_what_fades_in(scene, device):
 
 
 def test_what_is_read_since_settling_does_not_fade_in(scene, device):
-    """It comes with the next picture, and with that it is all there."""
+    """It is complete in the next picture."""
     renderer = Renderer(scene, device=device, memory="64MB")
     pool = renderer.pool_frame.core
     options = {"budget": None, "min_level": 0, "fade": 1.05, **FINE}
@@ -385,8 +384,8 @@ def test_without_a_fade_pages_are_there_at_once(scene, device, monkeypatch):
 
 
 def test_pages_that_come_again_fade_in_again(device, monkeypatch):
-    """With room for what one view needs, not for two, and with frames without a fade in
-    between.
+    """The room is enough for one view, but not for two, and frames without a fade are
+    in between. No page of the last picture is evicted.
 
     None leaves that the picture before showed.
     """
@@ -463,7 +462,7 @@ def test_what_a_pool_cannot_do_is_refused(asset, device):
     with pytest.raises(ValueError, match="cut: a renderer with a pool selects its own cut"):
         render(asset, CAMERA, cut=cut, device=device, memory="1MB")
     renderer = Renderer(asset, device=device)
-    renderer.settle(CAMERA)  # all is there
+    renderer.settle(CAMERA)  # all pages are resident
 
 
 def damage(path, page):
@@ -476,7 +475,7 @@ def damage(path, page):
 
 
 def draws_coarser(renderer):
-    """Pictures until pages failed; they are drawn nevertheless."""
+    """Return the pictures until pages failed; they are drawn with coarser pages."""
     deadline = time.monotonic() + 30
     while (image := renderer.render(CAMERA, tolerance=0.0)).stats.failed == 0:
         assert time.monotonic() < deadline
@@ -493,15 +492,15 @@ def test_damaged_page_leaves_the_picture_coarser_and_is_named(path, device):
     draws_coarser(renderer)
     with pytest.raises(ValueError, match=r"asset\.v3dg: page 3: the hash does not match"):
         renderer.settle(CAMERA, tolerance=0.0)
-    # All but that page are there.
+    # All pages except that one are resident.
     assert host(renderer.render(CAMERA, tolerance=0.0).alpha).max() > 0.1
-    damage(path, 3)  # back
+    damage(path, 3)  # the camera returns
     renderer.settle(CAMERA, tolerance=0.0)
     assert_same(renderer.render(CAMERA, tolerance=0.0), whole)
 
 
 def test_of_pages_that_are_read_together_only_the_damaged_ones_fail(path, device):
-    damaged = [3, 4, 40]  # of the finest level, so none is below them
+    damaged = [3, 4, 40]  # it is of the finest level, so no page is below it
     for page in damaged:
         damage(path, page)
     renderer = Renderer(Bundle.open(path), device=device, memory="64MB")
@@ -544,7 +543,7 @@ def test_failing_disk_is_an_error_of_the_system(path, device):
     renderer = Renderer(bundle, device=device, memory="64MB")
     renderer.render(AWAY).stats  # noqa: B018  makes the pool
     own = {fd for fd in map(int, os.listdir("/proc/self/fd")) if links_to(fd, path)}
-    memory = os.open("/proc/self/mem", os.O_RDONLY)  # reads of its first pages are errors
+    memory = os.open("/proc/self/mem", os.O_RDONLY)  # reads of the first pages fail
     kept = os.dup(bundle._file._fd)
     try:
         for fd in own:
@@ -576,7 +575,7 @@ def test_disk_that_does_not_answer_ends_the_wait(path, device, monkeypatch):
         renderer.settle(CAMERA, timeout=0.2, **FINE)
     assert time.monotonic() - start < 20
     for _ in range(3):
-        image = renderer.render(CAMERA, **FINE)  # waits for nothing
+        image = renderer.render(CAMERA, **FINE)  # does not wait
     assert image.stats.missing > 0
     core = renderer.pool_frame.core
     while core.read_one():  # page by page, the most urgent first
@@ -589,7 +588,7 @@ def test_disk_that_does_not_answer_ends_the_wait(path, device, monkeypatch):
 
 def test_child_of_a_fork_is_told_to_make_another(path):
     renderer = Renderer(Bundle.open(path), device="cpu", memory="64MB")
-    for k in range(20):  # while threads read, in any of whose locks a fork may be
+    for k in range(20):  # while threads read, any of whose locks may be held during a fork
         renderer.render([CAMERA, NEAR][k % 2], **FINE)
         child = os.fork()
         if child == 0:
@@ -603,8 +602,8 @@ def test_child_of_a_fork_is_told_to_make_another(path):
 
 @pytest.mark.parametrize("num_threads", [2, 4])
 def test_stills_of_threads_are_settled(path, num_threads):
-    """They share a pool that has room for about one view: no thread draws from what
-    another one brought."""
+    """They share a pool with room for about one view. No thread draws from the pages of
+    another thread's view."""
     scene = Scene()
     scene.add(Bundle.open(path), positions=[[-1.0, 0, 0], [1, 0, 0]])
     cameras = [CAMERA, NEAR, AWAY] * 8
@@ -625,8 +624,8 @@ def test_stills_of_threads_are_settled(path, num_threads):
 
 
 def test_only_the_last_pool_of_stills_is_kept(path):
-    """A pool has threads and memory, which a bundle that is drawn with many sizes would
-    pile up."""
+    """A pool has threads and memory, which would accumulate for a bundle that is drawn
+    with many sizes."""
     bundle = Bundle.open(path)
     render(bundle, CAMERA, device="cpu", memory="64MB", **FINE)
     before = len(os.listdir("/proc/self/task"))
@@ -645,8 +644,7 @@ def test_stills_of_one_size_share_a_pool_whatever_its_text(path):
 
 
 def test_children_of_a_fork_draw_stills(path):
-    """They have a pool of their own, though the parent's threads may be at work in the
-    other one."""
+    """They have their own pool, even if threads of the parent use the other one."""
     bundle = Bundle.open(path)
     expected = arrays(render(bundle, NEAR, device="cpu", memory="64MB", **FINE))
     is_over = threading.Event()
@@ -674,8 +672,8 @@ def test_children_of_a_fork_draw_stills(path):
 
 
 def test_picking_from_a_pool_of_another_process_is_refused(path):
-    """Also while another thread of the parent draws: it does not wait for that thread's
-    lock for ever."""
+    """This also holds while another thread of the parent draws; the child does not wait
+    for its lock."""
     bundle = Bundle.open(path)
     renderer = Renderer(bundle, device="cpu", memory="64MB")
     renderer.settle(CAMERA, **FINE)
@@ -704,7 +702,7 @@ def test_picking_from_a_pool_of_another_process_is_refused(path):
 
 
 def exit_code(child):
-    """Of a child that ends within a minute; -9 of one that does not."""
+    """Return the exit code of a child that ends within a minute; -9 if it does not."""
     end = time.monotonic() + 60
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -727,8 +725,8 @@ def test_devices_need_the_same_pages(scene):
 
 @pytest.mark.gpu
 def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
-    """Many in flight, of views that need other pages each, without a look at any of
-    them."""
+    """Many pictures of views with different pages are in flight, and none of them is
+    looked at."""
     renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
     rng = np.random.default_rng(5)
     cameras = [
@@ -747,8 +745,7 @@ def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
 
 @pytest.mark.gpu
 def test_pages_that_leave_before_a_frame_has_them_are_not_drawn(scene):
-    """Several pictures are looked at without one in between that takes what came and
-    left meanwhile."""
+    """Several pictures are awaited, with none in between that applies the changes."""
     renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
     rng = np.random.default_rng(7)
     for _ in range(20):
@@ -774,6 +771,6 @@ def test_graphs_of_a_pool_are_refused(scene):
     renderer = Renderer(scene, device="cuda", memory="64MB")
     renderer.render(CAMERA).stats  # noqa: B018
     with torch.cuda.graph(torch.cuda.CUDAGraph()):
-        torch.zeros(1, device="cuda")  # for torch warns of graphs without work
+        torch.zeros(1, device="cuda")  # because torch warns of empty graphs
         with pytest.raises(RuntimeError, match="cannot be captured in a CUDA graph"):
             renderer.render(CAMERA)

@@ -1,5 +1,5 @@
-"""Pools of a size that is chosen: from what is free on the device, and only where not
-all fits there."""
+"""Pools whose size is chosen from the free memory of the device, and only if not
+everything fits there."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def path(request, tmp_path):
 
 @pytest.fixture
 def free(monkeypatch):
-    """Sets what is free, by device: on the one that is drawn on, or on the host."""
+    """Set the free memory of the device that draws, and of the host."""
 
     def set_free(num_bytes, where=None):
         real = v3dg.pool.free_on
@@ -46,8 +46,8 @@ def assert_same(image, expected):
 
 
 def size_of(path, device):
-    """What all of a bundle takes on the device, and on the host beside it if that is
-    another."""
+    """Return the size of a whole bundle on the device and, if that is another, on the
+    host."""
     return residency.bytes_to_add([Bundle.open(path)], _device.resolve(device))
 
 
@@ -76,7 +76,7 @@ def test_all_is_resident_where_it_fits(path, device):
 
 def test_what_does_not_fit_gets_a_pool_and_says_so(path, device, free):
     needed = max(size_of(path, device).values())
-    free(needed)  # of which a quarter is kept back
+    free(needed)  # a quarter of it is kept free
     bundle = Bundle.open(path)
     renderer = Renderer(bundle, device=device)
     assert renderer.memory == needed // 2
@@ -92,10 +92,11 @@ def test_what_does_not_fit_gets_a_pool_and_says_so(path, device, free):
 
 
 def test_the_rule_is_what_is_free_less_a_quarter_of_it_or_a_gib(path, device, free):
-    """To the byte: of little a quarter is kept back, of much 1 GiB."""
+    """The rule is exact to the byte: a quarter of the free memory is kept free, but at
+    most 1 GiB."""
     where, bundle = _device.resolve(device), Bundle.open(path)
     needed = max(size_of(path, device).values())
-    least = -(-needed * 4 // 3)  # of which three quarters are enough
+    least = -(-needed * 4 // 3)  # of which three quarters suffice
     while least - least // 4 < needed:
         least += 1
     free(least)
@@ -104,7 +105,7 @@ def test_the_rule_is_what_is_free_less_a_quarter_of_it_or_a_gib(path, device, fr
     assert v3dg.pool.chosen_bytes([bundle], where) == (least - 2) // 2
 
     class Large:
-        """Of 10 GiB."""
+        """Claims a size of 10 GiB."""
 
         codec, is_in_memory, page_bytes, num_gaussians = "quantized", False, 10 * GIB, 0
 
@@ -122,7 +123,7 @@ def test_the_rule_is_what_is_free_less_a_quarter_of_it_or_a_gib(path, device, fr
 @pytest.mark.gpu
 def test_the_host_has_to_hold_what_a_gpu_draws_whole(path, free):
     bundle = Bundle.open(path)
-    free(bundle.page_bytes, CPU)  # of which a quarter is kept back
+    free(bundle.page_bytes, CPU)  # a quarter of it is kept free
     assert Renderer(bundle, device="cuda").memory is not None
 
 
@@ -181,7 +182,7 @@ def test_what_is_free_on_the_host_follows_the_container(monkeypatch):
     assert v3dg.pool.free_on(CPU) == 4096 << 10
 
 
-# Colours
+# Colours.
 
 
 @pytest.fixture
@@ -215,21 +216,21 @@ def test_residency_tells_what_waits_for_pages_from_what_is_wanted(scene, monkeyp
             np.abs(image.color[covered] / image.alpha[covered][:, None] - there).max(axis=1) > 0.1
         )
 
-    # So that nothing is read until it is asked for.
+    # Nothing is read until it is requested.
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     renderer = Renderer(scene, device="cpu", memory="64MB", color_by="residency")
     first = renderer.render(CAMERA, **options)
-    assert share_missing(first).mean() > 0.99  # the coarsest, everywhere
+    assert share_missing(first).mean() > 0.99  # the coarsest pages everywhere
     far = Camera.look_at((0, -60, 1), (0, 0, 0), (0, 0, 1), 0.13, width=93, height=61)
     coarse = renderer.render(far, tolerance=1e9)
-    assert share_missing(coarse).mean() == 0  # which is what is wanted here
+    assert share_missing(coarse).mean() == 0  # this is wanted here
     shares = [share_missing(first).mean()]
     pool = renderer.pool_frame.core
     while renderer.render(CAMERA, **options).stats.missing:
         for _ in range(20):
             pool.read_one()
         shares.append(share_missing(renderer.render(CAMERA, **options)).mean())
-    for _ in range(40 if fade else 0):  # until what came in last is there whole
+    for _ in range(40 if fade else 0):  # until the last page has faded in
         shares.append(share_missing(renderer.render(CAMERA, **options)).mean())
     assert any(0.05 < share < 0.95 for share in shares)
     assert shares[-1] == 0

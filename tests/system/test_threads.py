@@ -1,5 +1,5 @@
-"""Several threads, forked processes, torch beside us: the same results, and no
-deadlock."""
+"""Several threads, forked processes, and torch in the same process: the same results,
+and no deadlock."""
 
 import copy
 import hashlib
@@ -22,7 +22,7 @@ from command_line import TESTS_ENVIRONMENT
 from devices import host
 
 CAMERA = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
-SECONDS = 120  # more than any of this takes, on a machine that has more to do
+SECONDS = 120  # longer than any of these takes on a busy machine
 
 
 def digest(*arrays):
@@ -62,7 +62,7 @@ def frame(scene, device="cpu"):
 
 
 def frame_and_cut(scene, device):
-    """Both use what is kept of a scene."""
+    """Draw a frame and select a cut, which both use the resident data of a scene."""
     cut = v3dg.select(scene, CAMERA, tolerance=2.0, device=device)
     return frame(scene, device), digest(cut.instance_ids, cut.cluster_ids)
 
@@ -102,8 +102,8 @@ def test_threads_get_what_one_gets_alone(work, subjects, device):
 
 
 def test_threads_may_draw_a_bundle_that_was_never_drawn(device):
-    """What is kept of a bundle is made when it is first drawn, by all of them at
-    once."""
+    """The resident data of a bundle is created when it is first drawn, by all threads
+    at once."""
     expected = frame(crowd(3), device)
     scene, start = crowd(3), threading.Barrier(8)
 
@@ -131,7 +131,7 @@ def test_streams_of_several_threads_get_what_one_gets_alone():
 
 
 def test_threads_may_share_a_renderer_of_an_asset(device, hasty):
-    """Pictures of many sizes, for which memory is asked for while others draw."""
+    """Pictures have many sizes, whose memory is allocated while other threads draw."""
     subject = asset() if device == "cpu" else asset().torch(device)
     cameras = [CAMERA.scaled(1 + k % 4) for k in range(8)]
 
@@ -151,7 +151,7 @@ def test_threads_may_share_a_renderer_of_an_asset(device, hasty):
 
 @pytest.fixture
 def hasty():
-    """Threads that take turns as often as they can."""
+    """Make threads take turns as often as possible."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield
@@ -159,8 +159,8 @@ def hasty():
 
 
 def while_another_changes(change, work, times):
-    """What `work` gives, so often, while a thread calls `change` with 0, 1, 2 and so
-    on."""
+    """Return the results of many calls of `work`, while a thread calls `change` with 0,
+    1, 2 and so on."""
     stop = threading.Event()
 
     def go_on():
@@ -200,8 +200,8 @@ def test_frames_of_a_scene_that_moves_are_old_or_new(device, hasty):
 
 
 def test_frames_of_a_scene_that_grows_and_shrinks_are_old_or_new(device, hasty):
-    """A bundle that comes in the middle, too; and a cut of what is gone is refused or
-    drawn as it was."""
+    """A bundle is added meanwhile, too. A cut of removed instances is refused, or drawn
+    as it was."""
     scene, other = crowd(6), crowd(7).bundles[0]
     cut = v3dg.select(scene, CAMERA, tolerance=2.0, device=device)
 
@@ -281,7 +281,7 @@ def call_what_takes_long(folder):
 
 
 def test_other_threads_go_on_while_the_core_is_at_work(tmp_path, monkeypatch):
-    """A thread that looks at the clock all the time is never kept from it for most of a
+    """A thread that reads the clock all the time is never blocked for most of a
     call."""
     pytest.importorskip("torch")
     looks, stop, blocked = [], threading.Event(), dict.fromkeys(LONG, 1.0)
@@ -323,7 +323,7 @@ def test_other_threads_go_on_while_the_core_is_at_work(tmp_path, monkeypatch):
 
 
 def run(script, **environment):
-    """What a script of its own prints, which may not hang."""
+    """Return what a separate script prints; it may not hang."""
     done = subprocess.run(
         [sys.executable, "-W", "ignore::DeprecationWarning", "-c", script],
         env=TESTS_ENVIRONMENT | environment,
@@ -354,7 +354,7 @@ def test_one_thread_gives_the_same(expected, threads):
 
 
 def test_forked_process_gives_the_same(expected):
-    """Also a child's child, and the parent afterwards."""
+    """This also holds for a child of a child, and for the parent afterwards."""
     script = """
 import os
 def in_child(work):
@@ -374,8 +374,7 @@ show()
 
 
 def test_processes_may_be_forked_while_threads_draw(expected):
-    """As data loaders do: multiprocessing's fork, from a process whose threads are at
-    work."""
+    """Data loaders do this: multiprocessing forks a process whose threads work."""
     script = """
 import multiprocessing, threading
 stop = threading.Event()
@@ -418,8 +417,8 @@ for t in threads: t.join()
     "libasan" in Path("/proc/self/maps").read_text(), reason="the address checks need all addresses"
 )
 def test_memory_that_runs_out_is_an_error_and_nothing_else():
-    """At any moment: the process goes on, and once there is memory again, the results
-    are the same."""
+    """This holds at any moment: the process continues, and once there is memory again,
+    the results are the same."""
     script = """
 import resource
 from collections import Counter
@@ -442,8 +441,8 @@ for work, subject in zip((picture, gradient, frame, bundle_of), subjects):
     print(work.__name__, seen["MemoryError"] > 0, work(subject) == expected)
 """
     pytest.importorskip("torch")
-    # One arena that gives back at once what it is given, so that the limit is soon
-    # felt.
+    # There is one arena that returns freed memory at once, so that the limit takes
+    # effect soon.
     allocator = {
         "MALLOC_ARENA_MAX": "1",
         "MALLOC_TRIM_THRESHOLD_": "0",
@@ -455,7 +454,7 @@ for work, subject in zip((picture, gradient, frame, bundle_of), subjects):
 
 
 def test_thread_that_ends_before_its_first_line_is_an_error(monkeypatch):
-    """As it does where there is no memory to begin; threading.Thread would wait for it
+    """Threads end like this if there is no memory to begin; threading.Thread would wait
     for ever."""
     starts_nothing = SimpleNamespace(start_new_thread=lambda work, arguments: 0)
     monkeypatch.setattr(sys.modules["v3dg.levels.fit"], "_thread", starts_nothing)

@@ -1,5 +1,5 @@
 """Two CUDA devices in one process: work is done where its arrays are, whichever device
-is the current one."""
+is current."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def assert_same(image, expected, device=None):
 
 @pytest.fixture(autouse=True)
 def first_device():
-    """The first is the current one, before and after."""
+    """Make the first device current before and after each test."""
     import torch
 
     with torch.cuda.device(0):
@@ -87,7 +87,7 @@ def test_renderer_stays_on_its_device(subject):
 
 
 def test_scene_that_moves_is_drawn_on_both():
-    """Poses that lie on one device are brought to the other."""
+    """Poses on one device are copied to the other."""
     import torch
 
     scene = composed_scene(5)

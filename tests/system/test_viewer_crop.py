@@ -1,4 +1,5 @@
-"""A page crops what is shown by a box: which file comes of it, and where none may."""
+"""A page crops the shown asset by a box: which file this gives, and where cropping is
+refused."""
 
 import time
 from urllib.parse import urlsplit
@@ -36,7 +37,7 @@ def site(folder):
 
 
 def crop(tab, name, keep="inside", box=BOX, instance=0):
-    """Ask for a crop; the notice or the file that answers, or None after half a
+    """Request a crop; return the notice or the file that answers, or None after half a
     second."""
     tab.notices.clear()
     tab.answers.pop("done", None)
@@ -88,7 +89,7 @@ def test_no_file_is_ever_overwritten(site, folder):
 def test_other_names_write_nothing(site, folder, name):
     with viewer_client.Tab(site.port) as tab:
         tab.send({"type": "crop", "instance": 0, "box": BOX, "keep": "inside", "name": name})
-        assert "was written" in crop(tab, "after.ply")  # the connection goes on
+        assert "was written" in crop(tab, "after.ply")  # the connection still works
     names = ["after.ply", "blob.v3dg"]
     assert sorted(path.name for path in folder.iterdir()) == names
     assert not (folder.parent / "up.ply").exists()

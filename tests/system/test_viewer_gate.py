@@ -1,4 +1,4 @@
-"""Who may use the viewer, and what their messages can bring about."""
+"""Who may use the viewer, and what their messages can cause."""
 
 import copy
 import http.client
@@ -36,7 +36,7 @@ SECONDS = 60
 
 @pytest.fixture
 def opened(blob_view):
-    """Opens sites that are closed after the test."""
+    """Open sites that are closed after the test."""
     sites = []
 
     def open_site(**options):
@@ -49,7 +49,7 @@ def opened(blob_view):
 
 
 def status(site, path="/", **headers):
-    """What a request for a page is answered with."""
+    """Return the status of the answer to a request for a page."""
     connection = http.client.HTTPConnection("127.0.0.1", site.port, timeout=SECONDS)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
@@ -59,7 +59,7 @@ def status(site, path="/", **headers):
 
 
 def connects(site, path="/", **headers):
-    """Whether a page with these headers can use the site."""
+    """Return whether a page with these headers can use the site."""
     try:
         viewer_client.Tab(site.port, path, additional_headers=headers).__exit__()
     except websockets.exceptions.InvalidStatus as refusal:
@@ -125,7 +125,8 @@ def test_other_pages_cannot_use_the_viewer(opened, origin):
     ],
 )
 def test_names_that_others_lead_here_are_refused(opened, host):
-    """A page whose name is made to mean this machine has an Origin that is its Host."""
+    """A page under a name that was made to resolve to this machine has an Origin that
+    equals its Host."""
     site = opened()
     host = host.format(port=site.port)
     assert status(site, Host=host.encode()) == 403
@@ -138,7 +139,7 @@ def test_names_that_others_lead_here_are_refused(opened, host):
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "127.8.7.6", "[::1]"])
 def test_this_machine_may_use_the_viewer_by_any_of_its_names(opened, name):
-    """Also at another port, from which a connection may be forwarded."""
+    """This also holds for another port, from which a connection may be forwarded."""
     site = opened()
     for host in (f"{name}:{site.port}", f"{name}:9999", name):
         assert site._gate.refusal(request(Host=host, Origin=f"http://{host}")) is None
@@ -158,8 +159,8 @@ TAB = {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
     "relation", ["cross-site", "same-site", "", "Same-Origin", "none, cross-site"]
 )
 def test_pages_of_other_sites_are_shown_nothing(opened, relation):
-    """The browser says how they are related to the viewer, also for pictures, which
-    have no Origin."""
+    """The browser says how they are related to the viewer, also for requests of
+    pictures, which have no Origin."""
     site = opened()
     for path in ("/", "/main.js", "/photograph/0", "/connection"):
         for destination in ("image", "script", "style", "iframe", "object", "empty"):
@@ -281,7 +282,7 @@ def test_photographs_of_cameras_are_handed_out_small(opened, tmp_path):
 
 
 def test_a_photograph_that_cannot_be_decoded_is_not_there(opened, tmp_path, monkeypatch):
-    """Pillow raises SyntaxError and struct.error, too, for damaged files."""
+    """For damaged files, Pillow also raises SyntaxError and struct.error."""
 
     def fail(*_):
         raise SyntaxError("not a TIFF file")
@@ -386,7 +387,7 @@ NASTY = [
 
 
 def mutated(rng, message):
-    """The message with one thing changed, at times with more."""
+    """Return the message with one or more changes."""
     message = copy.deepcopy(message)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         place, nasty = message, copy.deepcopy(rng.choice(NASTY))
@@ -406,7 +407,7 @@ def mutated(rng, message):
 
 
 def hostile(rng, messages, kinds):
-    """Something that no browser sends."""
+    """Return something that no browser sends."""
     choice, message = rng.random(), mutated(rng, rng.choice(messages))
     if choice < 0.7:
         return message
@@ -423,8 +424,8 @@ def hostile(rng, messages, kinds):
 
 
 def test_no_message_ends_the_viewer(opened, blob_view, capfd):
-    """Thousands of wrong ones, with right ones between, while the viewer draws: it is
-    silent and goes on."""
+    """Thousands of wrong messages with valid ones in between are sent while the viewer
+    draws. It ignores the wrong ones and continues."""
     aside = v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)
     site, rng = opened(cameras={"aside": aside}), random.Random(7)
     kinds = [kind.__struct_config__.tag for kind in messages.Message.__args__]
@@ -447,7 +448,7 @@ def test_no_message_ends_the_viewer(opened, blob_view, capfd):
                 tab.look(View((1, 0, 0, 0), (1e15, -1e15, 0), 1e-4, 1.0), (1, 1 << 20))
                 tab.pictures(time.perf_counter() + 0.2)
             except websockets.exceptions.ConnectionClosed:
-                pass  # which is what such a client may expect
+                pass  # a client like this may expect this
     for now, before in zip(blob_view.scene.poses, poses, strict=True):
         assert np.isfinite(now).all()
         assert now.shape == before.shape

@@ -1,5 +1,5 @@
-"""The viewer's server and command: where they listen, what a tab begins with, and how
-they end."""
+"""The viewer's server and its command: the address, the first messages to a tab, and
+how they end."""
 
 import contextlib
 import os
@@ -24,8 +24,8 @@ from v3dg.viewer.server import Site, start_view
 websockets = pytest.importorskip("websockets")
 
 pytestmark = [
-    # A site that closes while somebody is just connecting leaves its end of the
-    # connection to the collector.
+    # If a site closes while a client is connecting, its end of the connection is left
+    # to the garbage collector.
     pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
     pytest.mark.usefixtures("collected_connections"),
 ]
@@ -104,7 +104,8 @@ def test_tab_begins_with_all_of_the_scene_in_view(blob_view, up):
 
 @contextlib.contextmanager
 def viewing(bundle, folder, *options):
-    """The command in a session of its own, once it has said where; and its line."""
+    """Yield the command in a separate session once it has printed its address, and the
+    line that it printed."""
     bundle.write(folder / "blob.v3dg")
     environment = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
     process = subprocess.Popen(
@@ -115,8 +116,8 @@ def viewing(bundle, folder, *options):
         text=True,
         env=environment,
         start_new_session=True,
-        # Whoever starts the tests in the background has them ignore interrupts, and
-        # children inherit that.
+        # If the tests are started in the background, they ignore interrupts, and
+        # children inherit this.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
@@ -127,7 +128,8 @@ def viewing(bundle, folder, *options):
 
 
 def ends(process, *signals):
-    """Whether it ends as it should after these, each a moment after the one before."""
+    """Return whether the command ends as it should after these signals, each a moment
+    after the one before."""
     for number in signals:
         process.send_signal(number)
         time.sleep(random.uniform(0.0, 0.05))
@@ -142,7 +144,7 @@ def test_command_says_where_and_ends_with_an_interrupt(blob_bundle, tmp_path):
         address = line.split()[0]
         with socket.create_connection(("127.0.0.1", int(address.rsplit(":", 1)[1]))) as silent:
             silent.shutdown(socket.SHUT_WR)
-            assert silent.recv(1) == b""  # the server has seen it
+            assert silent.recv(1) == b""  # the server has noticed it
         with urllib.request.urlopen(address) as answer:
             assert answer.status == 200
         ends(process, signal.SIGINT)
@@ -205,8 +207,8 @@ JOBS = ("film", "picture", "play", "cameras")
 )
 @pytest.mark.parametrize("turn", range(INTERRUPTS))
 def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_path, signals, turn):
-    """V3DG_INTERRUPTS sets the turns; each interrupts at another moment of drawing and
-    of jobs that begin."""
+    """V3DG_INTERRUPTS is the number of rounds; each interrupts at another moment of
+    drawing and of starting jobs."""
     viewer_client = pytest.importorskip("viewer_client")
     home, end = start_view(blob_view, (0, 0, 1)), time.monotonic() + random.uniform(0.2, 1.0)
     with viewing(blob_bundle, tmp_path) as (process, line):

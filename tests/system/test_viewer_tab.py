@@ -1,4 +1,4 @@
-"""A tab of the viewer, from the page's side of its connection, which viewer_client
+"""A tab of the viewer, seen from the page's side of its connection, which viewer_client
 plays."""
 
 import io
@@ -42,7 +42,7 @@ def site(blob_bundle, tmp_path_factory):
 
 
 def in_json(settings):
-    """Settings as the page is told them."""
+    """Return settings in the form in which the page receives them."""
     return json.loads(json.dumps(asdict(settings)))
 
 
@@ -55,7 +55,7 @@ def tab(site):
 
 
 def settled(tab):
-    """The picture at rest: in full, and of what was asked for last."""
+    """Return the picture at rest: in full size, and of the last request."""
     last, end = None, time.monotonic() + 60
     while time.monotonic() < end:
         pictures = tab.pictures(time.perf_counter() + 0.1)
@@ -79,7 +79,7 @@ def saved(tab, what, name, path=()):
 
 
 def beside(site):
-    """The view from a quarter of a turn on."""
+    """Return the view after a quarter of a turn."""
     x, y, z = site.home.position
     return look_at((-y, x, z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect)
 
@@ -342,4 +342,4 @@ def test_picture_is_saved_in_full(tab, site):
     with Image.open(io.BytesIO(saved(tab, "picture", "blobs.png"))) as picture:
         pixels = np.asarray(picture).astype(int)
     assert pixels.shape == shown.shape
-    assert abs(pixels - shown).mean() < 3  # but for JPEG
+    assert abs(pixels - shown).mean() < 3  # except for JPEG

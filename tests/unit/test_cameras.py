@@ -36,7 +36,7 @@ def test_look_at_centres_the_target(eye, direction, up):
 
 
 def test_transposed_matrices_are_taken():
-    """Whoever passes `matrix.T` has its columns in memory first; the core reads
+    """The memory of `matrix.T` is in column-major order, whereas the core reads
     rows."""
     turned = Camera.look_at((1, 2, 3), (4, 5, 7), width=64, height=48)
     camera = Camera(np.asfortranarray(turned.viewmat), np.asfortranarray(turned.K), 64, 48)
@@ -49,7 +49,8 @@ def test_transposed_matrices_are_taken():
     "again", [copy.copy, copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))]
 )
 def test_camera_is_copied_and_pickled_as_it_is(again):
-    """Also one that has been drawn with, which keeps what the core made of it."""
+    """This also holds for a camera that has been drawn, which keeps an object of the
+    core."""
     camera, drawn = (
         Camera.look_at((3, -4, 2), (0, 0, 0), width=64, height=48, near=0.5) for _ in range(2)
     )
@@ -67,11 +68,11 @@ def test_camera_of_the_core_is_made_once():
     assert camera.core is camera.core
     wider = replace(camera, width=128)
     assert wider.core is not camera.core
-    wider.core.window(64, 0, 128, 48)  # which the other has no room for
+    wider.core.window(64, 0, 128, 48)  # the other camera has no attribute for this
 
 
 def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
-    """Rows that are orthonormal only as far as float32 text goes, far from the
+    """The rows are orthonormal only up to the precision of float32 text, far from the
     origin."""
     exact = Camera.look_at((3e4, -2e4, 5e3), (1, 2, 3), width=64, height=48).viewmat
     viewmat = np.round(exact, 4)
@@ -82,7 +83,7 @@ def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
 
 def test_look_at_has_up_upwards_and_right_to_the_right():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), (0, 0, 1), math.pi / 2, width=200, height=100)
-    # Y is down: above is a smaller row.
+    # Y points down, so a higher point is in a smaller row.
     np.testing.assert_allclose(pixel(camera, (0, 0, 1))[0], [100, 30])
     np.testing.assert_allclose(pixel(camera, (1, 0, 0))[0], [120, 50])
     np.testing.assert_allclose(pixel(camera, (5, 0, 0))[0], [200, 50])  # half the field of view
@@ -95,7 +96,8 @@ def test_blender_camera_looks_along_minus_z():
     np.testing.assert_allclose(camera.position, (1, 2, 3))
     uv, depth = pixel(camera, (1, 2, 1))
     np.testing.assert_allclose((*uv, depth), (100, 50, 2))
-    np.testing.assert_allclose(pixel(camera, (1, 3, 1))[0], [100, 0], atol=1e-9)  # y up in Blender
+    # In Blender, y of a camera points up.
+    np.testing.assert_allclose(pixel(camera, (1, 3, 1))[0], [100, 0], atol=1e-9)
     assert camera.fy == camera.fx
     two_fields = Camera.from_blender(matrix, math.pi / 2, 200, 100, fov_y=math.pi / 2)
     assert two_fields.fy == pytest.approx(50)

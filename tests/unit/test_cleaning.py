@@ -1,4 +1,4 @@
-"""What is found to be wrong with an asset."""
+"""The faults that are found in an asset."""
 
 import numpy as np
 import pytest

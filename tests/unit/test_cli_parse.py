@@ -1,4 +1,5 @@
-"""The command line's parser: slips, and options that every command has."""
+"""The parser of the command line: mistakes of users, and options that every command
+has."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""gsplat's rasterization, as v3dg draws it: against autograd in float64, and with
+"""gsplat's interface for rasterization: compared with autograd in float64, and used by
 gsplat's own strategies."""
 
 import gc
@@ -31,14 +31,14 @@ CAMERAS = [FIRST]
 for _seed, _shift in (
     (1, 0.1),
     (2, -0.2),
-):  # near the first one, so that they see the same gaussians
+):  # near the first camera, so that they see the same gaussians
     _viewmat = FIRST.viewmat.copy()
     _viewmat[:3, 3] += _shift
     CAMERAS.append(Camera(_viewmat, FIRST.K * [[1 + _shift], [1], [1]], 23, 19))
 
 
 def of_cameras(cameras, *, dtype=torch.float64, device="cpu"):
-    """The arguments that say what cameras there are."""
+    """Return the arguments that describe the cameras."""
     return {
         "viewmats": torch.tensor(
             np.stack([c.viewmat for c in cameras]), dtype=dtype, device=device
@@ -52,13 +52,14 @@ def of_cameras(cameras, *, dtype=torch.float64, device="cpu"):
 def leaves(
     cameras, num=25, *, sh_degree=3, plain=False, dtype=torch.float64, device="cpu", seed=30
 ):
-    """Means, quats, scales, opacities, colours and backgrounds that want gradients."""
+    """Return means, quats, scales, opacities, colours and backgrounds that require
+    gradients."""
     gaussians = scenes.random_gaussians(
         seed, cameras[0], num, size_px=(0.5, 6), aspect=8, sh_degree=sh_degree, opacity=(0.05, 1.1)
     )
     arrays = [np.asarray(getattr(gaussians, name), np.float64) for name in scenes.NAMES]
     if plain:
-        arrays[4] = arrays[4][:, 0]  # some of them negative
+        arrays[4] = arrays[4][:, 0]  # some of them are negative
     arrays.append(np.random.default_rng(seed).uniform(-0.5, 1, (len(cameras), 3)))
     return [torch.tensor(a, dtype=dtype, device=device, requires_grad=True) for a in arrays]
 
@@ -70,7 +71,7 @@ def draw(inputs, cameras, **options):
 
 
 def expected(inputs, cameras, *, render_mode="RGB", sh_degree=None, antialiased=False):
-    """What `draw` returns, but the dict, by autograd's reference."""
+    """Return the result of `draw` except the dict, by the reference with autograd."""
     *shape, colors, backgrounds = inputs
     pictures, alphas = [], []
     for camera, background in zip(cameras, backgrounds, strict=True):
@@ -86,7 +87,7 @@ def expected(inputs, cameras, *, render_mode="RGB", sh_degree=None, antialiased=
 
 
 def weighted_sum(pictures, alphas, seed=0):
-    """A number that every pixel has a part in."""
+    """Return a number that depends on every pixel."""
     rng = np.random.default_rng(seed)
     return sum(
         (p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p)).sum()
@@ -99,7 +100,7 @@ def gradients(loss, inputs):
     return [torch.zeros_like(t) if g is None else g for g, t in zip(found, inputs, strict=True)]
 
 
-# Values and gradients
+# Values and gradients.
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -175,12 +176,12 @@ def test_a_camera_alone_is_drawn_as_v3dg_draws_it(device):
     np.testing.assert_array_equal(alphas[0, ..., 0].cpu(), image.alpha.cpu())
 
 
-# The dict
+# The dict of intermediate values.
 
 
 @pytest.fixture
 def located(monkeypatch):
-    """The tensors of centres that the reference makes, one a picture; they keep their
+    """Return the tensors of centres in the reference, one per picture; they keep their
     gradients."""
     found, project = [], rasterize_torch.project
 
@@ -296,7 +297,7 @@ def test_packed_dict_holds_the_pairs_in_sight(device):
     ids=["far_plane", "near_plane", "radius_clip"],
 )
 def test_what_is_clipped_is_not_there(device, clip, is_kept):
-    """Camera by camera: one may clip what another one shows."""
+    """One camera may clip a gaussian that another camera shows."""
     inputs = leaves(CAMERAS, 60, dtype=torch.float32, device=device)
     kept = is_kept(draw(inputs, CAMERAS, sh_degree=3, packed=False)[2])
     assert 0 < kept.sum() < kept.numel()
@@ -362,11 +363,11 @@ def test_no_call_outlives_its_results():
         gc.enable()
 
 
-# What is refused
+# Arguments that are refused.
 
 
 class Shutter(Enum):
-    """As gsplat's RollingShutterType prints itself."""
+    """Prints itself like gsplat's RollingShutterType."""
 
     GLOBAL, TOP_TO_BOTTOM = range(2)
 
@@ -436,12 +437,13 @@ def test_wrong_kinds_are_refused():
         rasterization_2dgs(*shape, colors)
 
 
-# gsplat's strategies
+# gsplat's strategies.
 
 
 @pytest.fixture
 def gsplat(monkeypatch):
-    """gsplat, with what its strategies compute on a GPU in torch."""
+    """Return the module gsplat, whose CUDA operations that the strategies use are
+    computed with torch."""
     gsplat = pytest.importorskip("gsplat")
     from gsplat.strategy import ops
 
@@ -459,7 +461,7 @@ def gsplat(monkeypatch):
 
 
 class Trainer:
-    """A few gaussians that are trained to pictures of others."""
+    """Trains a few gaussians so that they look like pictures of others."""
 
     def __init__(self, device, *, packed, absgrad=False):
         self.cameras = [
@@ -477,7 +479,7 @@ class Trainer:
         )
         first[2] = first[2].log()
         first[3] = torch.logit(first[3].clamp(0.1, 0.9))
-        first[3][:10] = -8  # too faint to be kept
+        first[3][:10] = -8  # so faint that it is pruned
         names = ("means", "quats", "scales", "opacities", "sh")
         self.params = {n: torch.nn.Parameter(t.detach()) for n, t in zip(names, first, strict=True)}
         self.optimizers = {n: torch.optim.Adam([p], lr=5e-3) for n, p in self.params.items()}

@@ -1,4 +1,5 @@
-"""Cameras with lens distortion: where gaussians are drawn, and what accepts them."""
+"""Cameras with lens distortion: where gaussians are drawn, and which functions accept
+them."""
 
 import math
 import pickle
@@ -14,7 +15,7 @@ from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import Camera, Gaussians, StereoCamera, select
 
 K = np.array([[150.0, 0, 103], [0, 140, 55], [0, 0, 1]])
-# OpenCV's order: k1, k2, p1, p2, k3 to k6.
+# This is the order of OpenCV: k1, k2, p1, p2, k3 to k6.
 LENSES = {
     "barrel": ("OPENCV", (-0.12, 0.01, 1e-3, -2e-3)),
     "pincushion": ("OPENCV", (0.12, 0.02, -1e-3, 1e-3, 0.005)),
@@ -83,7 +84,7 @@ def test_points_are_drawn_where_opencv_has_them(lens, device):
 
 
 def test_nothing_is_drawn_beyond_the_first_fold(device):
-    # The image of this lens turns back at a slope of 1 / sqrt(1.2).
+    # The image of this lens folds back at a slope of 1 / sqrt(1.2).
     folding = Camera(np.eye(4), K, 200, 120, distortion=(-0.4, 0, 0, 0), model="OPENCV")
     beyond = [1.4, 0.0, 1.0]
     u, v = image_of(folding, beyond)
@@ -143,14 +144,14 @@ def assert_same_bytes_of_color(image, other):
 
 def test_cuts_are_fine_enough_everywhere_in_the_image(lens):
     """No pixel has more px² per steradian than selection assumes, apart from the growth
-    towards the edges that is ignored for pinholes, too."""
+    towards the borders, which is ignored for pinholes, too."""
     camera = camera_of(lens)
     rng = np.random.default_rng(1)
     center = rng.uniform((1, 1), (camera.width - 1, camera.height - 1), (500, 2))
     corners = [camera.directions(center + shift) for shift in ([0, 0], [0.1, 0], [0, 0.1])]
     is_seen = np.isfinite(corners).all(axis=(0, 2))
     first, right, below = (c[is_seen] for c in corners)
-    # For OPENCV the areas are on the plane at depth 1.
+    # For OPENCV, the areas are on the plane at depth 1.
     area = np.linalg.norm(np.cross(right - first, below - first), axis=1)
     assert camera.core.px2_per_steradian >= (0.01 / area).max() * (1 - 1e-3)
 
@@ -317,6 +318,8 @@ def test_a_batch_of_lenses_is_drawn_as_its_cameras_alone(lens):
         distance = batch.distance[number]
         np.testing.assert_allclose(distance, alone.depth * lengths, rtol=1e-5)
         assert (distance > 0).any()
+    with pytest.raises(ValueError, match=r"^channels: 'clipped' is defined for pinholes"):
+        renderer.render_batch(v3dg.CameraBatch.of(cameras), channels=["clipped"])
 
 
 @pytest.mark.gpu

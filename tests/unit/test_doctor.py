@@ -1,4 +1,4 @@
-"""`v3dg doctor`."""
+"""The command `v3dg doctor`."""
 
 import json
 

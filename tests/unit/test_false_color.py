@@ -16,8 +16,8 @@ from v3dg.false_color import palette_of
 
 @pytest.mark.parametrize("by", ["level", "cluster"])
 def test_palette_draws_what_a_recoloured_copy_does(device, by):
-    """Bit for bit, also where neighbouring clusters of several instances are drawn
-    together."""
+    """The bits are the same, also where neighbouring clusters of several instances are
+    drawn together."""
     rng = np.random.default_rng(21)
     bundle = lod_bundle(rng, blob(rng, 300, sh_degree=2), 16)
     clusters = bundle.clusters
@@ -65,7 +65,7 @@ def test_palettes_of_what_is_resident_and_of_own_colours():
     palette = palette_of(bundle, "residency")
     assert palette.dtype == np.float32
     assert palette.shape == (len(bundle.clusters), 3)
-    assert (palette == palette[0]).all()  # no page is missing from a bundle in memory
+    assert (palette == palette[0]).all()  # a bundle in memory has all of its pages
     resident, missing = _core.missing_colors(np.array([0, 1 << 30], np.int32))
     np.testing.assert_allclose(_core.sh_base0 * palette[0] + 0.5, resident, atol=1e-6)
     assert not np.allclose(resident, missing)

@@ -1,4 +1,5 @@
-"""First views: all of an object in pictures of any aspect, a room from inside."""
+"""First views: they show the whole of an object in pictures of any aspect ratio, and a
+room from inside."""
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def rng():
 
 
 def box(rng, low, high, density=100.0):
-    """Points on the sides of a box, evenly."""
+    """Return points that are evenly distributed on the sides of a box."""
     low = np.array(low, float)
     high = np.array(high, float)
     sides = []
@@ -44,7 +45,7 @@ def asset_of(points, scale=0.06):
 
 
 def room(rng):
-    """Walls, a table and a cupboard."""
+    """Return walls, a table and a cupboard."""
     walls = box(rng, (-3, -2.6, -2), (3, 0, 2))
     table = box(rng, (-0.8, -0.8, -0.5), (0.8, -0.7, 0.5), 400)
     cupboard = box(rng, (-2.9, -2, -1.9), (-2.3, 0, 0))
@@ -52,14 +53,14 @@ def room(rng):
 
 
 def figure(rng):
-    """A body with a thin rod on its head, three times as high as wide."""
+    """Return a body with a thin rod on its head, three times as high as wide."""
     body = box(rng, (-0.3, -1.8, -0.15), (0.3, 0, 0.15), 2000)
     rod = box(rng, (-0.02, -3.2, -0.02), (0.02, -1.8, 0.02), 500)
     return asset_of(np.concatenate([body, rod]), 0.015)
 
 
 def town(rng):
-    """Blocks on a ground."""
+    """Return blocks on a ground."""
     blocks = [box(rng, (-60, 0, -60), (60, 0.2, 60), 1)]
     for x in range(-50, 51, 11):
         for z in range(-50, 51, 11):
@@ -68,7 +69,7 @@ def town(rng):
 
 
 def in_pixels(camera, points):
-    """(N, 3) columns, rows and depths."""
+    """Return (N, 3) columns, rows and depths."""
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     columns = camera.fx * local[:, 0] / local[:, 2] + camera.cx
     rows = camera.fy * local[:, 1] / local[:, 2] + camera.cy
@@ -89,7 +90,8 @@ def test_no_picture_of_an_object_is_cut(rng, make, size):
         assert columns.max() < size[0]
         assert rows.min() > 0
         assert rows.max() < size[1]
-    # And the first one leaves little free: one side of the picture is nearly filled.
+    # The first view also leaves little space: the subject nearly fills one dimension of
+    # the picture.
     first = in_pixels(cameras[0], asset.means.astype(float))
     filled = max(np.ptp(first[:, 0]) / size[0], np.ptp(first[:, 1]) / size[1])
     assert filled > 0.75

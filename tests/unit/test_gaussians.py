@@ -222,7 +222,7 @@ def test_tensors_keep_their_gradients():
     twice = Gaussians.concatenate([tensors, tensors.subset([1, 1])])
     twice.means.sum().backward()
     assert torch.equal(tensors.means.grad[:, 0], torch.tensor([1.0, 3.0, 1.0, 1.0]))
-    assert len(tensors.numpy()) == 4  # a tensor with a gradient is no obstacle
+    assert len(tensors.numpy()) == 4  # a tensor with a gradient is accepted
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""`Image` and `RenderedImage`: planes, what is missing, and when a drawing is asked."""
+"""`Image` and `RenderedImage`: their planes, missing planes, and when they wait for a
+drawing."""
 
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ STATS = Stats(12, 7, 3.0, 0.5, 1.5)
 
 
 class Drawing:
-    """A drawing of the core, which counts how often somebody waits for it."""
+    """A drawing of the core that counts how often it is waited for."""
 
     def __init__(self, *, exceeds_budget=False):
         self.color = COLOR

@@ -1,5 +1,5 @@
-"""Formats by file name, runs of trainers, and what assets take on disk; files of each
-format are tested in tests/files."""
+"""File formats by their names, folders of trainers, and sizes of assets on disk;
+tests/files has tests of each format."""
 
 from pathlib import Path
 

@@ -8,7 +8,7 @@ from v3dg.pictures import to_8bit
 
 
 def picture(seed, height=40, width=56):
-    """Smooth colours with a little noise, float32 (H,W,3) in [0,1]."""
+    """Return smooth colours with a little noise, float32 (H, W, 3) in [0, 1]."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:height, 0:width] / 10
     waves = np.stack([np.sin(x + k) * np.cos(y - 2 * k) for k in range(3)], -1)
@@ -18,8 +18,8 @@ def picture(seed, height=40, width=56):
 
 
 def ssim_by_windows(a, b):
-    """SSIM by its definition: one weighted 11x11 window after another, mirrored at the
-    border, in double."""
+    """Return SSIM by its definition, in double precision: weighted windows of 11 x 11,
+    mirrored at the borders."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
     window = (window / window.sum())[:, :, None]

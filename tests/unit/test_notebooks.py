@@ -1,4 +1,4 @@
-"""What notebooks show of pictures and bundles."""
+"""The representations of pictures and bundles in notebooks."""
 
 import io
 

@@ -1,5 +1,5 @@
-"""Every number that users pass: used, or refused in one line that names it; no cast,
-crash or warning."""
+"""Every number of a user is used, or refused with one line that names it, without a
+cast, a crash or a warning."""
 
 import inspect
 import math
@@ -41,10 +41,10 @@ def exported(write, **given):
         write(BUNDLE, folder, **given)
 
 
-# Each function with arguments that are right; those that are numbers, or arrays of
-# them, are tried.
+# Each function with valid arguments; those that are numbers, or arrays of numbers, are
+# exchanged.
 def drawn_small(camera):
-    """A picture for panoramas of any width, which costs nothing."""
+    """Return a picture for panoramas of any width, which takes no time."""
     shape = (min(camera.height, 64), min(camera.width, 64))
     return v3dg.Image(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), None)
 
@@ -229,7 +229,7 @@ VALUES = [
 
 
 def replaced(good, value):
-    """The value itself, or an array with it somewhere."""
+    """Return the value itself, or an array that contains it."""
     if np.ndim(good) == 0:
         return value
     rows = np.array(good, object)
@@ -298,7 +298,7 @@ def test_every_public_function_with_numbers_is_tried():
         "read_cameras",
         "Selection.check",
         "view",
-    }  # a seed of any size; files have tests of their own
+    }  # a seed of any size; files have their own tests
     assert with_numbers - others - tried == set()
 
 
@@ -313,7 +313,7 @@ def test_views_that_no_picture_can_hold_are_refused(setting):
 
 @pytest.mark.parametrize("setting", [{"px2_per_gaussian": 1e20}, {"distance": 1e300}])
 def test_the_core_refuses_them_too(setting):
-    """Where nothing has looked at the settings before."""
+    """These settings were not checked before."""
     config = v3dg.BuildConfig(cluster_size=16, steps=1, num_views=2)
     for name, value in setting.items():
         object.__setattr__(config, name, value)

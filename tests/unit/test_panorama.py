@@ -1,4 +1,4 @@
-"""Equirectangular pictures: where directions lie, and no seams."""
+"""Equirectangular pictures: the positions of directions, and no seams."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ CAMERA = v3dg.Camera.look_at((0, 0, 0), (0, 5, 0), (0, 0, 1), width=8, height=8)
 
 
 def directions(camera):
-    """(H, W, 3) of a camera's pixels, in the world."""
+    """Return the directions (H, W, 3) of a camera's pixels in the world."""
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     local = np.stack(
         [
@@ -25,7 +25,7 @@ def directions(camera):
 
 
 def draw_directions(camera):
-    """A picture whose colours are directions."""
+    """Return a picture whose colours are directions."""
     color = (0.5 + 0.5 * directions(camera)).astype(np.float32)
     return Image(color, np.ones(color.shape[:2], np.float32), None)
 
@@ -37,7 +37,7 @@ def test_every_direction_is_in_its_place():
     assert image.alpha.min() == pytest.approx(1.0)
     longitudes = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
     latitudes = (0.5 - (np.arange(64)[:, None] + 0.5) / 64) * np.pi
-    # The camera looks along y, with x to its right and z upwards.
+    # The camera looks along y, with x to the right and z up.
     expected = np.stack(
         [
             np.cos(latitudes) * np.sin(longitudes),
@@ -46,7 +46,7 @@ def test_every_direction_is_in_its_place():
         ],
         axis=-1,
     )
-    # The error of bilinear interpolation of a smooth picture.
+    # This is the error of bilinear interpolation in a smooth picture.
     np.testing.assert_allclose(2 * image.color - 1, expected, atol=2e-3)
 
 

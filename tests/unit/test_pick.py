@@ -1,4 +1,4 @@
-"""What a pixel shows."""
+"""Picking: which gaussian a pixel shows."""
 
 from dataclasses import replace
 
@@ -17,7 +17,8 @@ def pairs(selection):
 
 
 def composed(rng, count):
-    """Instances of a laid-out bundle and of random trees, some important."""
+    """Return instances of a bundle with the layout of a build and of random trees, some
+    of them important."""
     scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 8), count, spread=8)
     scene.add(random_bundle(int(rng.integers(1 << 30)), num_levels=4), rng.normal(size=(3, 3)))
     scene.set_importance(np.exp(rng.normal(size=len(scene))))
@@ -40,8 +41,8 @@ def test_pick_finds_what_a_pixel_shows():
         seen += 1
         assert (found.instance, found.cluster) in pairs(full)
         assert 0 < found.weight <= image.alpha[y, x] + 1e-6
-        # Without its cluster the pixel loses at least as much as the picked gaussian
-        # gave, behind or not.
+        # Without its cluster, the pixel loses at least the contribution of the picked
+        # gaussian, whatever is behind it.
         keep = (full.instance_ids != found.instance) | (full.cluster_ids != found.cluster)
         rest = replace(
             full, instance_ids=full.instance_ids[keep], cluster_ids=full.cluster_ids[keep]

@@ -1,4 +1,4 @@
-"""Pictures of 8 bits: rounding, contact sheets, and files."""
+"""Pictures with 8 bits: rounding, contact sheets, and files."""
 
 import io
 
@@ -61,7 +61,8 @@ def test_a_contact_sheet_has_each_picture_below_its_text():
     assert (sheet == (255, 0, 0)).all(axis=2).sum() == red[..., 0].size
     assert (sheet == (0, 0, 255)).all(axis=2).sum() == 2 * blue[..., 0].size
     rows = np.flatnonzero((sheet == (0, 0, 255)).all(axis=2).any(axis=1))
-    assert rows[9] - rows[0] > 30  # the second row begins below the highest of the first
+    # The second row begins below the highest picture of the first row.
+    assert rows[9] - rows[0] > 30
 
 
 def test_sizes_beyond_the_limits_are_refused():

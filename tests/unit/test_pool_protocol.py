@@ -1,16 +1,16 @@
-"""A model of how a pool settles, of which all interleavings are tried.
+"""A model of how a pool settles. All interleavings of its threads are tried.
 
-The threads of a pool (csrc/residency/pool_shared.h) are three here: one that settles a
-view and then draws it, the one that decides, and one that reads. A step is what a
-thread does while it holds the lock, or what it does without it; any thread that can
-take a step may take the next one. The view needs a page and, below it, another one,
-which its cut asks for only once the first is in the page table of its frame. An earlier
-frame, of another view, may have left needs that are not decided about; deciding about
-them may bring a page of its own, and may raise the tolerance.
+The model has three threads of a pool (csrc/residency/pool_shared.h): one settles a view
+and then draws it, one decides, and one reads. A step is what a thread does while it
+holds the lock, or what it does without the lock. Any thread that can do a step may do
+the next one. The view needs a page, and another page below it, which its cut requests
+only once the first page is in the page table of its frame. An earlier frame with
+another view may have left needs about which the pool has not decided yet. That decision
+may load another page, and may raise the tolerance.
 
-`RULES` are what the pool does so that a settled view is drawn complete. Without any one
-of them the model finds an interleaving that draws a picture with a page missing or at a
-raised tolerance.
+`RULES` are the rules by which the pool draws settled views completely. Without any one
+of them, the model finds an interleaving that draws a picture with a missing page or at
+a raised tolerance.
 """
 
 from dataclasses import dataclass, replace
@@ -20,11 +20,10 @@ import pytest
 
 UPPER, LOWER, OTHER = "upper", "lower", "other"
 SETTLED_VIEW, EARLIER_VIEW = "settled", "earlier"
-# The view is settled once the pool has decided about it and its own frame, whose page
+# The view is settled once the pool has decided about it, and its own frame, whose page
 # table the cut used, missed nothing.
 ABSENT_PAGES = "absent pages"
-# Before it settles, earlier needs are forgotten, and a round that is under way is
-# waited for.
+# Before it settles, earlier needs are forgotten, and a round in progress is waited for.
 CLEAN_START = "clean start"
 RULES = frozenset({ABSENT_PAGES, CLEAN_START})
 
@@ -37,23 +36,23 @@ class Needs:
 
 @dataclass(frozen=True)
 class State:
-    """All that the threads share, and where each of them is."""
+    """The data that the threads share, and the position of each thread."""
 
-    step: str  # of the thread that settles
-    table: frozenset[str] = frozenset()  # pages that its frames draw
-    num_absent: int = 0  # pages that its last cut missed
+    step: str  # position of the thread that settles
+    table: frozenset[str] = frozenset()  # the pages that its frames draw
+    num_absent: int = 0  # the pages that its last cut missed
     noted: Needs | None = None
     decided_view: str = ""
     missing: int = 1
     has_noted: bool = False
     is_raised: bool = False
     ready: frozenset[str] = frozenset()
-    resident: frozenset[str] = frozenset()  # for who decides: in a slot
+    resident: frozenset[str] = frozenset()  # needs in the slot of the deciding thread
     todo: frozenset[str] = frozenset()
     loading: frozenset[str] = frozenset()
     read: frozenset[str] = frozenset()
     wants_round: bool = False
-    is_served: bool = False  # the round that is under way is the one that is waited for
+    is_served: bool = False  # whether the round in progress is waited for
     round_is_over: bool = False
     is_deciding: bool = False
     decides: Needs | None = None
@@ -61,8 +60,8 @@ class State:
 
 
 def cut(table):
-    """Pages that the view asks for with this page table: the lower one only below the
-    upper one."""
+    """Return the pages that the view requests with this page table; it requests the
+    lower one only below the upper one."""
     return frozenset({UPPER, LOWER}) if UPPER in table else frozenset({UPPER})
 
 
@@ -71,7 +70,7 @@ def may_note(state):
 
 
 def settling_steps(state, rules):
-    """What the thread that settles may do next."""
+    """Yield the steps that the settling thread can do next."""
     if state.step == "start":
         if CLEAN_START in rules:
             if not state.is_deciding:
@@ -110,7 +109,8 @@ def settling_steps(state, rules):
 
 
 def deciding_steps(state):
-    """What the thread that decides may do next: begin a round, or end it."""
+    """Yield the steps that the deciding thread can do next: it begins or ends a
+    round."""
     if state.is_deciding:
         resident = state.resident | state.loaded
         after = replace(
@@ -124,8 +124,8 @@ def deciding_steps(state):
             is_served=False,
         )
         if state.decides is not None:
-            # What comes in this round is noted as missing, for the needs are looked at
-            # first.
+            # A page that arrives during this round is noted as missing, because the
+            # needs are read first.
             absent = state.decides.pages - state.resident
             after = replace(
                 after,
@@ -151,7 +151,8 @@ def deciding_steps(state):
 
 
 def reading_steps(state):
-    """What a thread that reads may do next: begin with a page, or end with one."""
+    """Yield the steps that a reading thread can do next: it begins or finishes a
+    page."""
     for page in state.todo - state.loading - state.read - state.loaded - state.resident:
         yield replace(state, todo=state.todo - {page}, loading=state.loading | {page})
     for page in state.loading:
@@ -159,7 +160,7 @@ def reading_steps(state):
 
 
 def starts():
-    """What an earlier frame may have left."""
+    """Yield the states that an earlier frame may have left."""
     earlier = Needs(EARLIER_VIEW, frozenset({OTHER}))
     pages = [frozenset(), frozenset({UPPER}), frozenset({OTHER}), frozenset({UPPER, OTHER})]
     for noted, loading in product([None, earlier], pages):
@@ -176,7 +177,8 @@ def starts():
 
 
 def faults(rules):
-    """What is wrong in states that can be reached, and how many states there are."""
+    """Return the faults in states that can be reached, and the number of these
+    states."""
     found = set()
     seen = set(starts())
     todo = list(seen)

@@ -1,4 +1,5 @@
-"""Levels refined together: what gets better, what stays, and one step by itself."""
+"""Levels that are refined together: what improves, what stays unchanged, and single
+steps."""
 
 import itertools
 import os
@@ -28,14 +29,14 @@ STEP_SIZES = dict(zip(SIZES, (1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4), strict=True))
 
 @pytest.fixture(scope="module")
 def bundle():
-    """Merged levels of a small donut, which leave much to be made better."""
+    """Return merged levels of a small donut, which can still be improved much."""
     config = BuildConfig(steps=0, cluster_size=128)
     return v3dg.build_bundle(make_donut(3000), config=config, device="cpu", progress=False)
 
 
 def distance_to_asset(bundle, device):
-    """Mean difference between cuts of several counts, from four sides, and the
-    asset."""
+    """Return the mean difference between the asset and cuts with several counts, from
+    four sides."""
     errors = []
     for camera in v3dg.turntable((0, 0, 0), 3.0, 4, width=48, height=48):
         truth = draw_truth(bundle.level_gaussians(0), camera, "cpu", 4).astype(np.float32) / 255
@@ -172,7 +173,7 @@ def pictures_of(bundle, cameras=()):
 
 
 def place_of(view):
-    """Where a window's camera is, and its size."""
+    """Return the position of the window's camera, and its size."""
     camera, *_ = view
     return tuple(camera.position), camera.width, camera.height
 
@@ -206,7 +207,8 @@ def test_a_picture_follows_from_its_number(bundle):
 
 
 def test_what_a_window_shows_is_the_cut_of_its_picture(bundle):
-    """Each path has one of its clusters at most, and what is left out is outside."""
+    """At most one cluster of each path is in the cut, and clusters that are left out
+    are outside the window."""
     pictures, parent = pictures_of(bundle), bundle.clusters.parent_group
     made = bundle.clusters.own_group
     for number in range(50):
@@ -228,8 +230,8 @@ def test_pictures_from_cameras_are_taken_there(bundle):
 
 
 def test_cuts_from_inside_are_of_coarse_levels_where_no_other_is_small_enough(bundle):
-    """Groups around the eye are refined at any tolerance: below what that leaves there
-    are whole levels."""
+    """Groups around the eye are refined at any tolerance. If too many gaussians remain,
+    whole levels are drawn instead."""
     center = np.median(bundle.level_gaussians(0).means, axis=0)
     camera = v3dg.Camera.look_at(
         center, center + np.array([0, 0, 1]), (0, 1, 0), fov_x=1.5, width=96, height=96
@@ -267,7 +269,7 @@ def test_a_camera_that_sees_nothing_changes_nothing(bundle, device):
 
 
 def test_cuts_from_a_camera_come_closer_to_the_asset(bundle, device):
-    """By more than they do from all around, in as many steps."""
+    """They come closer than with the same number of steps from all around."""
     camera = v3dg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), width=96, height=96)
     truth = draw_truth(bundle.level_gaussians(0), camera, "cpu", 4).astype(np.float32) / 255
 
@@ -284,8 +286,8 @@ def test_cuts_from_a_camera_come_closer_to_the_asset(bundle, device):
 
 
 def weights_of(bundle, device, steps, cameras=()):
-    """What `steps` pictures show of each gaussian, and how many have it in their
-    cuts."""
+    """Return how visible each gaussian is in the pictures of `steps`, and how many cuts
+    contain it."""
     gaussians = on(device, bundle.gaussians)
     config = fit_config(BuildConfig(steps=steps, first_steps=steps, filter_px2=0.1), 0, 1)
     return _core.weigh_cuts(
@@ -310,7 +312,7 @@ def test_what_is_seen_of_gaussians_adds_up_to_the_alpha_of_pictures(bundle, devi
 
 
 def test_looks_are_counted(bundle, device):
-    """Of a gaussian that is in a picture's cut, whether it shows there or not."""
+    """A gaussian in the cut of a picture counts, whether it is visible there or not."""
     _, num_looks = weights_of(bundle, device, 12)
     pictures, offset = pictures_of(bundle), bundle.clusters.offset
     expected = np.zeros(bundle.num_gaussians, int)
@@ -322,7 +324,7 @@ def test_looks_are_counted(bundle, device):
 
 @pytest.mark.slow
 def test_what_is_not_looked_at_stays(bundle, device):
-    """A camera that sees one side alone tells nothing of the other."""
+    """A camera that sees only one side does not change the other side."""
     camera = v3dg.Camera.look_at((0.75, 0, 0.6), (0.75, 0, 0), (0, 1, 0), 0.5, width=64, height=64)
     _, num_looks = weights_of(bundle, "cpu", 2000, [camera])
     assert (num_looks == 0).any()
@@ -337,7 +339,7 @@ def test_what_is_not_looked_at_stays(bundle, device):
 
 
 def levels_inside_a_shell():
-    """A bundle of a closed shell of opaque gaussians around some that nobody sees."""
+    """Return a bundle of a closed shell of opaque gaussians around hidden ones."""
     rng = np.random.default_rng(0)
     outwards = rng.normal(size=(3000, 3))
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
@@ -377,7 +379,8 @@ def test_what_nobody_sees_is_dropped_of_all_levels_but_the_first(device, tmp_pat
 
 
 def test_what_is_dropped_has_the_share_together(bundle):
-    """Of each level, and no gaussian that stays has less than one that goes."""
+    """The share holds for each level, and no remaining gaussian is less visible than a
+    dropped one."""
     rng = np.random.default_rng(0)
     weight = rng.exponential(size=bundle.num_gaussians)
     weight[rng.random(len(weight)) < 0.1] = np.nan  # not known
@@ -410,13 +413,14 @@ def arguments(bundle, device, config, pictures):
 
 
 def planned_views(pictures, num_windows):
-    """The windows of the first step: the first views, each with a cut of another
+    """Return the windows of the first step: the first views, each with a cut of another
     number."""
     return [pictures.view(number, number % 8) for number in range(num_windows)]
 
 
 def loss_of_window(window, drawn, leaves, samples, camera):
-    """The loss of a window relative to that of its pixels, as torch computes it."""
+    """Return the loss of a window relative to its number of pixels, computed with
+    torch."""
     import torch
 
     shape = replace(camera, K=window.K, width=window.width, height=window.height)
@@ -440,8 +444,8 @@ def loss_of_window(window, drawn, leaves, samples, camera):
 
 
 class Slopes:
-    """The slopes of the loss of a step's windows, as torch computes them, and how many
-    windows show each gaussian."""
+    """The gradients of the loss of a step's windows, computed with torch, and the
+    number of windows that show each gaussian."""
 
     def __init__(self, bundle, pictures, camera, num_windows):
         import torch
@@ -470,7 +474,7 @@ class Slopes:
 
 
 def steps_of(start, moved):
-    """How far each value moved, in the units of its step size."""
+    """Return how far each value moved, in units of its step size."""
     with np.errstate(divide="ignore", invalid="ignore"):  # an opacity of 1 has no logit
         logits = [
             np.log(opacities / (1 - opacities))
@@ -487,8 +491,8 @@ def steps_of(start, moved):
 
 @pytest.mark.parametrize("num_windows", [1, 5, 8])
 def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows):
-    """The first step of Adam has the sign of the slope, whatever that is, and the size
-    of the step times the root of the number of windows that show the gaussian."""
+    """The first step of Adam has the sign of the gradient. Its length is the step size
+    times the square root of the number of windows that show the gaussian."""
     pytest.importorskip("torch")
     config = replace(BuildConfig(), steps=1, first_steps=1, filter_px2=0.1, **STEP_SIZES)
     camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=160, height=160)[0]
@@ -504,7 +508,7 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows):
     moves[: len(bundle.level_gaussians(0))] = False
     if num_windows > 1:
         assert len(set(slopes.num_windows[moves])) > 1
-    is_faint = start.opacities < 0.99  # beyond, the logit of a float has few digits
+    is_faint = start.opacities < 0.99  # beyond it, the logit of a float has few digits
     for name, steps in steps_of(start, moved).items():
         is_compared = moves
         if name == "opacities":
@@ -537,7 +541,7 @@ def test_all_cuts_of_a_view_have_its_window(bundle):
 
 
 def test_steps_of_several_windows_are_the_same_with_any_number_of_them_ahead(bundle, device):
-    """A picture of the asset is replaced only after the steps that use it."""
+    """A picture of the asset is replaced only after all steps that use it."""
     config = BuildConfig(steps=90, first_steps=90, filter_px2=0.05)
 
     def moved():
@@ -552,7 +556,7 @@ def test_steps_of_several_windows_are_the_same_with_any_number_of_them_ahead(bun
 
 @pytest.mark.gpu
 def test_both_devices_take_the_same_steps(bundle):
-    """Several rounds of the pictures of the asset, each with new cuts."""
+    """The pictures of the asset are used several times, each time with new cuts."""
     config = BuildConfig(steps=40, first_steps=40, filter_px2=0.05)
     config = replace(config, **{name: 0.1 * getattr(config, name) for name in SIZES})
     moved = {}

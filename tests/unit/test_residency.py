@@ -1,5 +1,5 @@
-"""What is kept of bundles and scenes: made once a device, given back with its owner or
-all at once."""
+"""Data that is kept for bundles and scenes on a device: it is created once, and freed
+with its owner or with all other data."""
 
 import gc
 import itertools
@@ -30,8 +30,7 @@ def where(device):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Counts what is made: the name of each kind of the core's, as often as one was
-    made."""
+    """Count the objects that the core creates, by the name of their kind."""
     made = []
     for name in ("ClusterTable", "Model", "Palette", "SceneFrame", "ResidentScene"):
         monkeypatch.setattr(_core, name, counted(getattr(_core, name), made))
@@ -83,7 +82,7 @@ def test_added_bundle_leaves_the_others_where_they_are(where, made):
     assert residency.model(first, where) is model
     assert residency.gaussians(first, where) is gaussians
     now = residency.scene(scene, where)
-    assert (now is resident) == where.is_cuda  # on the CPU whoever draws what was keeps it
+    assert (now is resident) == where.is_cuda  # on the CPU, a drawing keeps what it uses alive
     assert now.bundles == (first, second)
     assert sorted(set(made) - {"ResidentScene"}) == ["ClusterTable", "Model"]
     assert len(made) == 2 + (now is not resident)
@@ -135,7 +134,7 @@ def test_bytes_grow_with_what_is_there(where):
         sizes.append(kept.num_bytes(where))
         make()
         assert kept.num_bytes(where) == sizes[-1]
-    # A gaussian of degree 1 is 23 floats, however they are laid out.
+    # A gaussian of degree 1 has 23 floats in every layout.
     assert sizes[1] >= 23 * 4 * len(asset.gaussians)
     assert all(a < b for a, b in itertools.pairwise(sizes))
     if where != CPU:
@@ -157,7 +156,7 @@ def test_what_is_cleared_is_made_again(where):
     for again in (
         render(asset, CAMERA, device=where),
         renderer.render(CAMERA),
-    ):  # which keeps what it has
+    ):  # keeps its data
         np.testing.assert_array_equal(host(again.color), host(image.color))
 
 
@@ -195,11 +194,11 @@ def test_threads_get_the_same(where, made):
 
 
 def test_no_lock_is_held_for_ever_in_a_child():
-    """A fork while another thread was asking leaves the child a lock that nobody gives
-    back."""
+    """If a process forks while another thread uses the cache, the child has a lock that
+    nobody releases."""
     kept = Residency()
     with ThreadPoolExecutor(1) as pool:
-        pool.submit(kept.lock.acquire).result()  # by a thread that a child has not
+        pool.submit(kept.lock.acquire).result()  # the child does not have this thread
         kept._after_fork()
         assert kept.table(bundle(0)) is not None
 

@@ -57,7 +57,8 @@ def test_rotations_are_rotations(quaternion):
     rotation = scene.rotations[0]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) > 0
-    axis = np.array(quaternion[1:]) / max(map(abs, quaternion))  # what the rotation leaves in place
+    # The rotation leaves this axis in place.
+    axis = np.array(quaternion[1:]) / max(map(abs, quaternion))
     np.testing.assert_allclose(rotation @ axis, axis, atol=1e-12)
 
 
@@ -135,7 +136,7 @@ def test_copies_of_scenes_and_cuts_go_their_own_way(take):
     scene, same = small_scene(), small_scene()
     cut = select(scene, CAMERA, tolerance=0.1, device="cpu")
     taken = take(scene)
-    assert (taken.bundles == scene.bundles) == (take is copy.copy)  # which are large
+    assert (taken.bundles == scene.bundles) == (take is copy.copy)  # the arrays are large
     drawn = render(scene, CAMERA, device="cpu").color
     np.testing.assert_array_equal(render(taken, CAMERA, device="cpu").color, drawn)
     taken.remove([0])
@@ -145,7 +146,7 @@ def test_copies_of_scenes_and_cuts_go_their_own_way(take):
     scene.move(scales=0.1)
     np.testing.assert_array_equal(taken.scales, 1)
 
-    cut_taken = take(cut)  # with its scene
+    cut_taken = take(cut)  # together with its scene
     np.testing.assert_array_equal(cut_taken.instance_ids, cut.instance_ids)
     np.testing.assert_array_equal(cut_taken.cluster_ids, cut.cluster_ids)
     of_copy = render(cut_taken.scene, CAMERA, cut=cut_taken, device="cpu")
@@ -176,8 +177,8 @@ def test_what_was_given_stays_the_users():
 
 
 def test_cut_of_instances_that_are_gone_is_refused():
-    """Though others have come in their places, of other bundles; not because others
-    came or they moved."""
+    """This holds even if instances of other bundles took their places; adding or moving
+    instances is no reason."""
     scene = small_scene()
     cut = select(scene, CAMERA, tolerance=0.1, device="cpu")
     num = len(cut.gaussians(device="cpu"))
@@ -213,7 +214,7 @@ def test_an_axis_that_is_none_is_refused_where_it_is_set():
 
 
 def with_up(up):
-    """A bundle whose file says which axis is up."""
+    """Return a bundle whose file says which axis is up."""
     return Bundle(OTHER.clusters, OTHER.groups, OTHER.gaussians, {"up": up}, OTHER.codec)
 
 
@@ -230,7 +231,7 @@ def test_up_turns_what_is_up_in_a_bundle_to_the_axis(up):
 
 def test_up_keeps_what_is_right_and_applies_before_the_pose():
     scene = Scene()
-    quarter = (np.sqrt(0.5), 0, 0, np.sqrt(0.5))  # about z: x to y
+    quarter = (np.sqrt(0.5), 0, 0, np.sqrt(0.5))  # about z: x becomes y
     scene.add(BUNDLE, (1, 2, 3), quarter, 2.0, up="z")
     np.testing.assert_allclose(scene.rotations[0] @ (1, 0, 0), (0, 1, 0), atol=1e-12)
     np.testing.assert_allclose(scene.rotations[0] @ (0, -1, 0), (0, 0, 1), atol=1e-12)

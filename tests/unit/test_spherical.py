@@ -328,6 +328,9 @@ ERRORS = {
     "memory: expected 'auto' or None": lambda: v3dg.render(
         dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), memory=10**9
     ),
+    "channels, mesh: expected none": lambda: v3dg.render(
+        dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), channels=["normal"]
+    ),
     "min_transmittance: expected None": lambda: v3dg.render(
         dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), min_transmittance=0.1
     ),

@@ -1,4 +1,4 @@
-"""Assets that are moved, turned and scaled."""
+"""Assets that are moved, rotated and scaled."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from v3dg.rotations import rotation_from_quaternion
 def test_transform_moves_turns_and_scales(kind):
     asset = random_gaussians(np.random.default_rng(0), 5)
     given = asset if kind == "numpy" else asset.torch("cpu")
-    turn = np.array([2.0, 0, 0, 2.0])  # a quarter about z, of any length
+    turn = np.array([2.0, 0, 0, 2.0])  # a quarter of a turn about z, with quaternions of any length
     moved = given.transform(turn, (1, 2, 3), 3.0)
     assert type(moved.means) is type(given.means)
     rotation = rotation_from_quaternion(turn / np.linalg.norm(turn))

@@ -1,4 +1,5 @@
-"""Which axis is up: what files say, and what is guessed from cameras and gaussians."""
+"""Which axis is up: the declaration of a file, and guesses from cameras and
+gaussians."""
 
 from __future__ import annotations
 
@@ -32,14 +33,14 @@ def rng():
 
 
 def spread(rng, widths, count=400):
-    """An asset whose gaussians are spread so widely along x, y and z."""
+    """Return an asset whose gaussians have these widths along x, y and z."""
     asset = scenes_lod.blob(rng, count, size=0.01)
     means = (rng.normal(size=(count, 3)) * widths).astype(np.float32)
     return v3dg.Gaussians(means, asset.quats, asset.scales, asset.opacities, asset.sh)
 
 
 def around(up, count=8):
-    """Cameras on a ring that look a little down."""
+    """Return cameras on a ring that look slightly down."""
     return {
         str(i): camera
         for i, camera in enumerate(
@@ -141,8 +142,8 @@ def test_bundle_keeps_what_is_up_and_commands_say_what_they_took(rng, tmp_path):
 
 
 def at_a_terminal(*arguments, answers, cwd):
-    """What a command says on stderr and on stdout to who types these lines, and its
-    exit code."""
+    """Return what a command prints on stderr and stdout if a user types these lines,
+    and its exit code."""
     ours, theirs = pty.openpty()
     command = [*COMMAND, *map(str, arguments)]
     process = subprocess.Popen(
@@ -191,7 +192,7 @@ def test_a_build_asks_at_a_terminal_what_nothing_tells(rng, tmp_path, answers, u
     for name, scales in (
         ("flat", (3, 2, 0.5)),
         ("round", (1, 1, 1)),
-    ):  # what tells, and without a terminal
+    ):  # a declaration, and no terminal
         v3dg.write_asset(tmp_path / f"{name}.ply", spread(rng, scales))
         run_here = at_a_terminal if name == "flat" else run
         given = {"answers": "\n"} if name == "flat" else {}
@@ -217,5 +218,5 @@ def test_commands_that_use_what_is_up_ask_at_a_terminal_once(rng, tmp_path):
 
 
 def test_what_is_told_is_not_guessed():
-    """Of an asset of 100 million gaussians a guess looks at all clusters."""
+    """A guess would read all clusters of an asset of 100 million gaussians."""
     assert choose_up("x", None, None, Path("asset.ply")) == ("x", [])

@@ -12,12 +12,13 @@ from typing import Annotated, Literal, TypeAlias
 
 import tyro
 
-from v3dg._numbers import check, refuse
+from v3dg._numbers import refuse
 from v3dg._progress import waiting
 from v3dg._urls import beside, cleaned, is_url, shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.io import SUFFIXES
+from v3dg.formats.content import content_of
+from v3dg.io import SUFFIXES, asset_file, is_asset_by_content
 from v3dg.opening import open_with_cameras
 from v3dg.scene import Subject
 
@@ -160,11 +161,22 @@ def require_file(path: Path, *suffixes: str) -> None:
         else:
             expected = f"a file, got a path that does not exist{_similar(path)}"
         refuse(path, expected)
+    if beside(asset_file(path)).name.lower().endswith(suffixes):
+        return
+    content = None
+    if not is_url(path):
+        content = content_of(path)
+    is_readable = content is not None and content.suffix in suffixes
+    if is_readable and is_asset_by_content(path):
+        return
     problem = "another suffix"
     if path.is_dir():
         problem = "a folder"
-    is_known = beside(path).name.lower().endswith(suffixes)
-    check(shown(path), is_known, f"a file ending in {', '.join(suffixes)}, got {problem}")
+    elif content is not None:
+        problem = content.text
+    if is_readable:
+        problem += "; rename it to end in that"
+    refuse(shown(path), f"a file ending in {', '.join(suffixes)}, got {problem}")
 
 
 def _similar(path: Path) -> str:

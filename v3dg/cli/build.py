@@ -24,7 +24,7 @@ from v3dg.cleaning import AssetWarning, coarse_note, describe
 from v3dg.cli import _common
 from v3dg.cli._views import ask_up, is_at_terminal
 from v3dg.gaussians import Gaussians
-from v3dg.io import SUFFIXES, open_asset, run_files, subject_name
+from v3dg.io import SUFFIXES, asset_file, open_asset, run_files, subject_name
 from v3dg.levels import BuildConfig, DraftWarning, build_file, levels_path
 from v3dg.levels.memory import free_bytes
 from v3dg.levels.quality import Quality, estimated_seconds, pictures_of, refine_bytes
@@ -266,11 +266,11 @@ def _print_many(options: Build, results: list[JsonObject], seconds: float) -> No
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
-    """Return the files of each asset, by the path that identifies it: a file, or the
-    folder of a trainer's run."""
+    """Return the files of each asset, by the path that identifies it: a file, or a
+    folder that is one asset or contains a trainer's run."""
     assets: dict[Path, list[Path]] = {}
     for path in paths:
-        if not path.is_dir():
+        if not path.is_dir() or asset_file(path) != path:
             assets[path] = [path]
         elif files := run_files(path):
             assets[path] = files

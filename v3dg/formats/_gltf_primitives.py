@@ -10,12 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from v3dg import _core
 from v3dg._json import Node
 from v3dg._numbers import Floats
 from v3dg.formats import _axes, spz
+from v3dg.formats._color_space import conversion_note, srgb_from_linear
 from v3dg.formats._gltf_accessors import column, count_of, has_data, indices
 from v3dg.formats._gltf_document import Document, name_text
 from v3dg.formats._packing import SH_C0, assemble
@@ -44,12 +43,6 @@ _PROPERTIES = {
 }
 _POINTS = 0
 _TRIANGLES = 4  # the default mode of a primitive
-# Number of directions in which converted colours are fitted by spherical harmonics:
-# enough for 16 coefficients.
-_NUM_DIRECTIONS = 64
-# Number of gaussians that are fitted together, small enough that their colours stay in
-# the cache.
-_FITTED_AT_ONCE = 1 << 12
 
 
 def is_gaussians(primitive: Node) -> bool:
@@ -117,7 +110,7 @@ class Primitive:
             accessor = self._document.item("accessors", self._node.field("indices"))
             gaussians = gaussians.subset(indices(self._document, accessor, len(gaussians)))
         if self._color_space == _LINEAR:
-            gaussians = _encoded(gaussians)
+            gaussians = srgb_from_linear(gaussians)
         return gaussians
 
     @property
@@ -293,10 +286,7 @@ class Primitive:
             elif values is None and name not in ("extensions", "extras"):
                 notes.append(f"{name_text(name)} of {NAME} is not read.")
         if self._color_space == _LINEAR:
-            notes.append(
-                f"Colours are linear ({_LINEAR}); they are converted to sRGB, in which they are "
-                "then blended."
-            )
+            notes.append(conversion_note(_LINEAR))
         mode = _TRIANGLES
         if self._node.has("mode"):
             mode = integer_of(self._node.field("mode"), "0 to 6", 0, 6)
@@ -311,7 +301,7 @@ class Primitive:
         return notes
 
     def _packed_notes(self, packed: _Packed) -> list[str]:
-        notes = list(spz.flag_notes(packed.header))
+        notes = spz.header_notes(packed.header)
         if self._is_released:
             notes.append(
                 f"Its .spz was turned from the axes of .spz to those of glTF, as {SPZ} says; "
@@ -330,38 +320,3 @@ class Primitive:
 
 def _unread(extensions: Node) -> list[str]:
     return [name for name in extensions.some_fields(()) if name not in READ_EXTENSIONS]
-
-
-def _encoded(gaussians: Gaussians) -> Gaussians:
-    """Return gaussians whose linear colours are converted to sRGB. Spherical harmonics
-    are fitted to the converted colours in directions all around."""
-    bases = _core.sh_bases(gaussians.sh_degree, _directions())
-    inverse = np.linalg.pinv(bases)
-
-    def encode(rows: slice) -> NDArray[np.float64]:
-        colors = np.einsum("dk,nkc->ndc", bases, gaussians.sh[rows].astype(np.float64)) + 0.5
-        encoded = _srgb_from_linear(colors) - 0.5
-        return np.asarray(np.einsum("kd,ndc->nkc", inverse, encoded))
-
-    sh = np.empty_like(gaussians.sh)
-    with np.errstate(invalid="ignore", over="ignore"):
-        for start in range(0, len(gaussians), _FITTED_AT_ONCE):
-            rows = slice(start, start + _FITTED_AT_ONCE)
-            sh[rows] = encode(rows)
-    encoded = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
-    return encoded.trained(antialiased=gaussians.antialiased)
-
-
-def _directions() -> Floats:
-    """Return (D, 3) unit vectors that are evenly distributed: a Fibonacci lattice."""
-    steps = np.arange(_NUM_DIRECTIONS)
-    z = 1 - (2 * steps + 1) / _NUM_DIRECTIONS
-    angles = steps * np.pi * (3 - np.sqrt(5))
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angles), radius * np.sin(angles), z], axis=1)
-
-
-def _srgb_from_linear(colors: Floats) -> Floats:
-    """Convert linear colours to sRGB (IEC 61966-2-1). Negative values become black."""
-    light = np.maximum(colors, 0.0)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

@@ -9,8 +9,9 @@ import numpy.typing as npt
 
 from v3dg._json import JsonObject
 from v3dg.cleaning import SMALLEST_OPACITY, ball_of_most
-from v3dg.formats._packing import SH_C0, Limits, log_scales
+from v3dg.formats._packing import SH_C0, Limits, blocks, log_scales
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised, product
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Losses:
         position_error: Largest error of a coordinate, relative to the diameter of the
             ball that contains most gaussians.
         scale_error: Largest relative error of a scale that was not clipped.
+        rotation_error: Largest angle in degrees by which an ellipsoid is turned.
         color_error: Largest error of a colour of degree 0 that was not clipped; 1 is
             the difference between black and white.
         harmonics_error: Largest error of a coefficient of a higher degree that was not
@@ -35,6 +37,7 @@ class Losses:
     cut: dict[str, int]
     position_error: float
     scale_error: float
+    rotation_error: float
     color_error: float
     harmonics_error: float
     limits: Limits
@@ -47,7 +50,8 @@ class Losses:
             counts = ", ".join(f"{count:,} {self._kind(kind)}" for kind, count in self.cut.items())
             lines.append(f"cut to what the format holds: {counts}")
         errors = f"positions {self.position_error:.1e} of the size"
-        errors += f", scales {self.scale_error:.1%}, colours {self.color_error:.4f}"
+        errors += f", scales {self.scale_error:.1%}, rotations {self.rotation_error:.2g}°"
+        errors += f", colours {self.color_error:.4f}"
         if self.harmonics_error:
             errors += f", harmonics {self.harmonics_error:.4f}"
         return [*lines, f"largest errors of rounding: {errors}"]
@@ -57,6 +61,7 @@ class Losses:
         errors = {
             "positions": self.position_error,
             "scales": self.scale_error,
+            "rotations": self.rotation_error,
             "colors": self.color_error,
             "harmonics": self.harmonics_error,
         }
@@ -95,6 +100,7 @@ def losses(written: Gaussians, read: Gaussians, limits: Limits) -> Losses:
         cut={kind: int(mask.sum()) for kind, mask in is_cut.items() if mask.any()},
         position_error=_largest_error(written.means, read.means, all_kept) / size,
         scale_error=math.expm1(log_error),
+        rotation_error=_largest_angle(written.quats, read.quats),
         color_error=SH_C0 * _largest_error(written.sh[:, 0], read.sh[:, 0], is_cut["colors"]),
         harmonics_error=_largest_error(higher, read.sh[:, 1:], is_cut["harmonics"]),
         limits=limits,
@@ -114,3 +120,17 @@ def _largest_error(
 ) -> float:
     errors = np.abs(values.astype(np.float64) - read)
     return float(errors[~is_cut].max(initial=0.0))
+
+
+def _largest_angle(quats: npt.NDArray[np.floating], read: npt.NDArray[np.floating]) -> float:
+    """Return the largest angle in degrees by which an ellipsoid is turned after reading.
+    Half turns about its own axes do not turn it."""
+    largest = 0.0
+    for rows in blocks(len(quats)):
+        back = normalised(quats[rows]) * np.array([1, -1, -1, -1])
+        # The components of the rotation between both. The largest one is that of no
+        # turn, or of a half turn about an axis.
+        between = np.sort(np.abs(product(back, normalised(read[rows]))), axis=1)
+        rest = np.linalg.norm(between[:, :3], axis=1)
+        largest = max(largest, 2 * np.arctan2(rest, between[:, 3]).max())
+    return math.degrees(largest)

@@ -11,6 +11,7 @@ others. Some programs store the axes of `.ply` without declaring them. If the ga
 contain a ground, it shows which axes they have. See docs/formats.md.
 """
 
+import itertools
 import math
 import struct
 import zlib
@@ -47,6 +48,7 @@ MAX_START = 1 << 16
 the optional fields of a gzip header."""
 _MAX_TRAILER = 1 << 20  # bytes for extensions of vendors, after the attributes
 _COLOR_SCALE = 0.15
+_MAX_DEGREE = 3  # coefficients of degree 4 are dropped
 _LARGEST_FIXED = (1 << 23) - 1
 # Bits of the flags.
 _ANTIALIASED = 1
@@ -79,10 +81,15 @@ class Header(NamedTuple):
     """The header of a file."""
 
     version: int
-    sh_degree: int
+    stored_degree: int  # of spherical harmonics, 0 to 4
     fraction_bits: int  # fraction bits of the fixed-point positions
     num_gaussians: int
     flags: int
+
+    @property
+    def sh_degree(self) -> int:
+        """The SH degree that is read."""
+        return min(self.stored_degree, _MAX_DEGREE)
 
     @property
     def antialiased(self) -> bool:
@@ -99,7 +106,7 @@ class Header(NamedTuple):
         rotation_bytes = 3
         if self.version >= 3:
             rotation_bytes = 4
-        sh_bytes = 3 * ((self.sh_degree + 1) ** 2 - 1)
+        sh_bytes = 3 * ((self.stored_degree + 1) ** 2 - 1)
         widths = (position_bytes, 1, 3, 3, rotation_bytes, sh_bytes)
         return [self.num_gaussians * width for width in widths]
 
@@ -251,9 +258,23 @@ def _bytes(values: Floats) -> bytes:
 
 def _rotation_bytes(quats: Floats) -> bytes:
     """Return the components x y z as bytes, after negating quaternions whose w is
-    negative."""
+    negative.
+
+    Readers derive w, which depends strongly on the bytes if it is small. So each
+    component is rounded up or down such that the rotation is as close as possible.
+    """
     unit = normalised(quats)
-    return _bytes((unit[:, 1:] * np.where(unit[:, :1] < 0, -1.0, 1.0) + 1.0) * 127.5)
+    unit = unit * np.where(unit[:, :1] < 0, -1.0, 1.0)
+    low = np.floor((unit[:, 1:] + 1.0) * 127.5)
+    best = np.zeros((len(unit), 3), np.uint8)
+    best_cosine = np.full(len(unit), -1.0)
+    for ups in itertools.product((0, 1), repeat=3):
+        rounded = np.minimum(low + ups, 255).astype(np.uint8)
+        cosine = np.abs((_quats(rounded) * unit).sum(axis=1))
+        is_closer = cosine > best_cosine
+        best[is_closer] = rounded[is_closer]
+        best_cosine[is_closer] = cosine[is_closer]
+    return best.tobytes()
 
 
 def _rotation_words(quats: Floats) -> bytes:
@@ -329,15 +350,18 @@ def _notes(content: _Content) -> tuple[str, ...]:
         for kind, payload in _records(content.extensions)
         if kind != _AXES_EXTENSION
     )
-    return (*flag_notes(content.header), *extensions)
+    return (*header_notes(content.header), *extensions)
 
 
-def flag_notes(header: Header) -> tuple[str, ...]:
-    """Return a sentence about unknown flags, if there are any."""
+def header_notes(header: Header) -> list[str]:
+    """Return sentences about what the header declares and what is ignored."""
+    notes = []
     unknown = header.flags & ~(_ANTIALIASED | _HAS_EXTENSIONS)
-    if not unknown:
-        return ()
-    return (f"Its flags {unknown:#04x} are unknown and were ignored.",)
+    if unknown:
+        notes.append(f"Its flags {unknown:#04x} are unknown and were ignored.")
+    if header.stored_degree > _MAX_DEGREE:
+        notes.append(f"Coefficients above SH degree {_MAX_DEGREE} were ignored.")
+    return notes
 
 
 def _decode(content: _Content) -> Gaussians:
@@ -352,6 +376,7 @@ def _decode(content: _Content) -> Gaussians:
         color = (colors[block] / 255.0 - 0.5) / _COLOR_SCALE
         higher = (higher_sh[block].astype(np.float64) - 128.0) / 128.0
         sh = np.concatenate([color[:, None], higher.reshape(len(color), -1, 3)], axis=1)
+        sh = sh[:, : (header.sh_degree + 1) ** 2]
         log_scales = scales[block] / 16.0 - 10.0
         return (
             _means(content, block),
@@ -381,7 +406,7 @@ def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> Header:
     magic, version, count, degree, fraction_bits, flags, _ = _HEADER.unpack_from(header)
     check(path, magic == _MAGIC, f".spz, which begins with NGSP, got {header[:4].hex(' ')}")
     check(path, 1 <= version <= 4, f".spz of version 1 to 4, got {version}")
-    check(path, degree <= 3, f"SH degree 0 to 3, got {degree}")
+    check(path, degree <= 4, f"SH degree 0 to 4, got {degree}")
     check(path, fraction_bits <= 24, f"at most 24 fraction bits, got {fraction_bits}")
     claims.add(path, count)
     return Header(version, degree, fraction_bits, count, flags)

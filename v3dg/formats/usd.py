@@ -32,6 +32,7 @@ from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
 from v3dg.editing import join
 from v3dg.formats import _axes
+from v3dg.formats._color_space import conversion_note, srgb_from_linear
 from v3dg.formats._declared import Declared
 from v3dg.formats._packing import check_writable
 from v3dg.formats._reading import AnyPath, AssetFile, listed, value_errors
@@ -60,7 +61,13 @@ _COLUMNS = (f"{_SH}Degree", *_HALVES, *(f"{name}h" for name in _HALVES))
 # Attributes that do not affect the appearance of gaussians, or that other functions
 # read.
 _HINTS = ("projectionModeHint", "sortingModeHint")
-_KNOWN = (*_COLUMNS, *_HINTS, "extent", "visibility", "purpose", "xformOpOrder")
+_COLOR_SPACE = "colorSpace:name"
+_KNOWN = (*_COLUMNS, *_HINTS, _COLOR_SPACE, "extent", "visibility", "purpose", "xformOpOrder")
+# Names of colour spaces of UsdColorSpaceAPI, those of glTF, and shorter ones of
+# MaterialX. Colours in sRGB, or without a colour space, are read as they are.
+_WRITTEN_COLOR_SPACE = "srgb_rec709_scene"
+_SRGB = ("", _WRITTEN_COLOR_SPACE, "srgb_rec709_display", "srgb_texture", "raw", "data", "unknown")
+_LINEAR = ("lin_rec709_scene", "lin_rec709_display", "lin_rec709")
 _MAX_DEGREE = 3  # coefficients of higher degrees are dropped
 _MOST_DEGREE = 100
 
@@ -369,7 +376,29 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
         opacities=opacities,
         sh=np.ascontiguousarray(sh),
     )
+    color_space = _color_space(prim)
+    if color_space in _LINEAR and harmonics.values is not None:
+        gaussians = srgb_from_linear(gaussians)
+        notes.append(conversion_note(color_space))
+    elif color_space not in (*_SRGB, *_LINEAR):
+        notes.append(f"The colour space {color_space[:40]!a} was read as sRGB.")
     return gaussians.trained(antialiased=_antialiased(prim)), notes
+
+
+def _color_space(prim: Usd.Prim) -> str:
+    """Return the name of the colour space of a prim's coefficients; empty if nothing
+    declares one. The attribute's own metadata is stronger than UsdColorSpaceAPI on the
+    prim, which is stronger than on its ancestors."""
+    for name in (f"{_SH}Coefficients", f"{_SH}Coefficientsh"):
+        attribute = prim.GetAttribute(name)
+        if attribute and attribute.HasColorSpace():
+            return str(attribute.GetColorSpace())
+    while prim:
+        attribute = prim.GetAttribute(_COLOR_SPACE)
+        if attribute and attribute.HasAuthoredValue():
+            return str(attribute.Get())
+        prim = prim.GetParent()
+    return ""
 
 
 def _antialiased(prim: Usd.Prim) -> bool | None:
@@ -503,6 +532,12 @@ def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
+    # Without these a reader that goes by primvars takes one coefficient for each
+    # gaussian; NVIDIA's requirement VG.035 asks for both.
+    harmonics = usd.UsdGeom.Primvar(prim.GetAttribute(f"{_SH}Coefficients"))
+    harmonics.SetInterpolation(usd.UsdGeom.Tokens.vertex)
+    harmonics.SetElementSize((host.sh_degree + 1) ** 2)
+    usd.Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(_WRITTEN_COLOR_SPACE)
     if host.antialiased is not None:
         prim.SetCustomDataByKey(_ANTIALIASED, host.antialiased)
     return prim

@@ -17,14 +17,19 @@ from v3dg.render.request import (
     Look,
     shade_of,
 )
+from v3dg.render.sensor import CHANNELS, MESH, Channel, MeshLayer
 
 __all__ = [
+    "CHANNELS",
+    "MESH",
     "BatchPlanes",
+    "Channel",
     "CutRequest",
     "Frame",
     "FrameRequest",
     "FrameSource",
     "Look",
+    "MeshLayer",
     "PoolFrame",
     "RenderedBatch",
     "Renderer",

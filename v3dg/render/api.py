@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast, get_args, overload
+from typing import TYPE_CHECKING, Literal, TypeAlias, cast, get_args, overload
 
-from v3dg import _core, _device
+from v3dg import _device
 from v3dg._device import Device
 from v3dg._numbers import check, one_of, vector, whole
 from v3dg.camera_batch import CameraBatch
@@ -24,6 +24,7 @@ from v3dg.render.picture import Picture
 from v3dg.render.rays import check_rays, draw_sphere
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
+from v3dg.render.sensor import Channel, MeshLayer, sensor_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 
 _MOST_PIXELS_A_CALL = 1 << 22
+_Pictures: TypeAlias = RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]
 
 
 class _Options(CutOptions, total=False):
@@ -44,6 +46,8 @@ class _Options(CutOptions, total=False):
     background: Sequence[float]
     min_transmittance: float | None
     depth: bool
+    channels: Sequence[Channel]
+    mesh: MeshLayer | None
     device: str | Device
     color_by: ColorBy
     memory: int | str | None
@@ -78,9 +82,11 @@ def render(
     background: Sequence[float] = BLACK,
     min_transmittance: float | None = None,
     depth: bool = False,
+    channels: Sequence[Channel] = (),
+    mesh: MeshLayer | None = None,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
-) -> Image | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
+) -> Image | _Pictures:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
@@ -100,8 +106,9 @@ def render(
             pictures have common statistics, which are sums, except for the number of
             selected gaussians. None means the first camera of a scene's file, else the
             camera of `first_camera`. An `EquirectangularCamera` is drawn on the CPU
-            with all gaussians resident, without statistics, and takes neither
-            `budget`, `cut`, `min_transmittance` nor a number of bytes as `memory`.
+            with all gaussians resident, without statistics, and takes none
+            of `budget`, `cut`, `min_transmittance`, `mesh`, channels other than
+            "depth", and a number of bytes as `memory`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -119,6 +126,13 @@ def render(
             0.001 from 9.5 px² on, where levels differ by more; with a budget, by the
             tolerance that meets it. Assets are then drawn as by `v3dg.rasterize`.
         depth: Whether to draw the expected depth, too.
+        channels: Names of channels that are drawn beside colour and alpha, and are then
+            attributes of the picture: "depth" (as `depth=True`), "median_depth",
+            "normal", "instance", "label", "weight", "clipped" (docs/sensors.md). All
+            but "depth" only on the CPU so far; "clipped" only for pinholes.
+        mesh: Picture of meshes of the same size, for one camera: its pixels hide what
+            is behind them. Colour, alpha and the channels are those of gaussians and
+            meshes together. Only on the CPU so far.
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what
             the next picture of the same scene or bundle needs; a `Renderer` controls
@@ -136,34 +150,32 @@ def render(
         opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
+    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth)
     if isinstance(camera, EquirectangularCamera):
-        check_rays(color_by, cut, min_transmittance, device, memory)
-        return draw_sphere(opened_subject, camera, cut_request, background, depth=depth)
+        check_rays(color_by, cut, sensor, min_transmittance, device, memory)
+        return draw_sphere(opened_subject, camera, cut_request, background, depth=with_depth)
     frame = _still_frame(opened_subject, color_by, _device.resolve(device), pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
-    shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
+    shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
         check_camera(view)
-        request = FrameRequest(view, cut_request, shade, cut)
+        request = FrameRequest(view, cut_request, shade, cut, sensor=sensor)
         return frame.chosen(opened_subject).draw_settled(opened_subject, request)
 
     if isinstance(camera, list | tuple) and cut is None and budget is None and are_alike(camera):
         scene_frame = frame.chosen(opened_subject)
         if isinstance(scene_frame, SceneFrame):
-            return _pictures_at_once(scene_frame, opened_subject, camera, cut_request, shade)
-    pictures: Picture | list[Picture] = for_each(camera, picture)
-    return cast(
-        "RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures
-    )
+            at_once = BatchRequest(CameraBatch.of(camera), cut_request, shade, None, sensor)
+            return _pictures_at_once(scene_frame, opened_subject, camera, at_once)
+    return cast(_Pictures, for_each(camera, picture))
 
 
 def _pictures_at_once(
     frame: SceneFrame,
     subject: Subject,
     cameras: Sequence[Camera],
-    cut: CutRequest,
-    shade: _core.Shade,
+    request: BatchRequest,
 ) -> list[RenderedImage]:
     """Return pictures that are drawn as batches: all by one call on a CUDA device; on
     the CPU a few at a time, so that the program can be interrupted."""
@@ -174,7 +186,7 @@ def _pictures_at_once(
     pictures: list[RenderedImage] = []
     for begin in range(0, len(cameras), size):
         part = CameraBatch.of(cameras[begin : begin + size])
-        batch = frame.draw_batch(subject, BatchRequest(part, cut, shade, None))
+        batch = frame.draw_batch(subject, request._replace(cameras=part))
         pictures += [batch[number] for number in range(len(part))]
     return pictures
 

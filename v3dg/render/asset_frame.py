@@ -60,9 +60,9 @@ class AssetFrame:
         check_request(request.cut)
         camera = request.camera
         if isinstance(camera, StereoCamera):
-            left, right = (self._draw_eye(eye, request.shade, stop) for eye in camera.eyes)
+            left, right = (self._draw_eye(eye, request, stop) for eye in camera.eyes)
             return left, right
-        return self._draw_eye(camera, request.shade, stop)
+        return self._draw_eye(camera, request, stop)
 
     draw_settled = draw
 
@@ -72,9 +72,9 @@ class AssetFrame:
         """Return at once, because all of an asset is resident."""
 
     def _draw_eye(
-        self, camera: Camera, shade: _core.Shade, stop: _core.Stop | None
+        self, camera: Camera, request: FrameRequest, stop: _core.Stop | None
     ) -> RenderedImage:
-        drawing = self._core.draw(camera.core, shade, stop)
+        drawing = self._core.draw(camera.core, request.shade, stop, request.sensor)
 
         def finish() -> Stats:
             return stats_of(drawing.finish(), 0.0)

@@ -13,7 +13,7 @@ from v3dg._device import Device
 from v3dg._numbers import Floats, check, check_type
 from v3dg.camera_batch import CameraBatch, form_of
 from v3dg.cameras import Camera
-from v3dg.image import Planes, RenderedImage, Stats
+from v3dg.image import ChannelPlanes, Planes, RenderedImage, Sensed, Stats
 from v3dg.render.request import CutRequest
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class BatchStats(NamedTuple):
     num_parts: int
 
 
-class RenderedBatch:
+class RenderedBatch(Sensed):
     """B pictures of H x W pixels.
 
     CUDA may still be drawing them; reading an attribute waits for the end.
@@ -140,6 +140,11 @@ class RenderedBatch:
         return torch.where(depth > 0, depth * lengths, 0).to(torch.float32)
 
     @property
+    def _channels(self) -> _core.Channels:
+        self._core.finish()
+        return self._core.channels
+
+    @property
     def stats(self) -> BatchStats:
         """The costs of drawing the pictures."""
         stats = self._core_stats()
@@ -163,7 +168,8 @@ class RenderedBatch:
         depth = self._core.depth
         if depth is not None:
             depth = depth[number]
-        return Planes(self._core.color[number][..., :3], self._alpha[number], depth)
+        color = self._core.color[number][..., :3]
+        return Planes(color, self._alpha[number], depth, _channels_of(self._channels, number))
 
     def picture_stats(self, number: int) -> Stats:
         """Return the costs of one picture; on CUDA, times are those of the whole
@@ -196,6 +202,24 @@ class RenderedBatch:
         return f"RenderedBatch({len(self)} pictures of {width}x{height})"
 
 
+def _channels_of(channels: _core.Channels, number: int) -> ChannelPlanes:
+    """Return the channels of one picture of a batch."""
+
+    def plane(of_all: Array | None) -> Array | None:
+        if of_all is None:
+            return None
+        return of_all[number]
+
+    return ChannelPlanes(
+        median_depth=plane(channels.median_depth),
+        normal=plane(channels.normal),
+        instance=plane(channels.instance),
+        label=plane(channels.label),
+        weight=plane(channels.weight),
+        clipped=plane(channels.clipped),
+    )
+
+
 class _PictureOfBatch(RenderedImage):
     """One picture of a batch."""
 
@@ -219,6 +243,7 @@ class BatchRequest(NamedTuple):
     cut: CutRequest
     shade: _core.Shade
     planes: BatchPlanes | None
+    sensor: _core.Sensor | None = None
 
 
 def draw_batch(
@@ -230,7 +255,10 @@ def draw_batch(
     if request.planes is not None:
         planes = request.planes.core
     rule = request.cut.rule
-    core = frame.draw_batch(resident.core, cameras.core_on(device), rule, request.shade, planes)
+    core_cameras = cameras.core_on(device)
+    core = frame.draw_batch(
+        resident.core, core_cameras, rule, request.shade, planes, request.sensor
+    )
     resident.add_drawing(core)
     return RenderedBatch(core, cameras, rule.tolerance_px2)
 

@@ -163,6 +163,7 @@ class PoolFrame:
             request.shade,
             None,
             look.core(resident.bundles),
+            request.sensor,
         )
         drawing = self._core.draw(resident.core, core_request, pool.core, steps, stop)
         status = pool.core.status()

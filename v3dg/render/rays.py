@@ -37,6 +37,7 @@ def check_rays_device(device: str | Device) -> None:
 def check_rays(
     color_by: ColorBy,
     cut: Selection | None,
+    sensor: _core.Sensor | None,
     min_transmittance: float | None,
     device: str | Device,
     memory: int | str | None,
@@ -44,6 +45,7 @@ def check_rays(
     """Raise ValueError for options of pictures that rays do not have."""
     check("cut", cut is None, "none for an equirectangular camera, got one; leave it out")
     check("color_by", color_by == "appearance", f"'appearance' for rays, got {color_by!r}")
+    check("channels, mesh", sensor is None, "none but 'depth' for rays, got others; leave them out")
     expected = f"None for rays, which end at {MIN_TRANSMITTANCE:g}, got {min_transmittance}"
     check("min_transmittance", min_transmittance is None, expected)
     expected = f"'auto' or None for rays, which need all gaussians in memory, got {memory!r}"

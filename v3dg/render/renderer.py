@@ -20,6 +20,7 @@ from v3dg.render.frame import frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
+from v3dg.render.sensor import Channel, MeshLayer, sensor_of
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
 
@@ -34,6 +35,8 @@ class _Options(CutOptions, total=False):
     background: Sequence[float]
     min_transmittance: float | None
     depth: bool
+    channels: Sequence[Channel]
+    mesh: MeshLayer | None
 
 
 class Renderer:
@@ -132,15 +135,18 @@ class Renderer:
         background: Sequence[float] = BLACK,
         min_transmittance: float | None = None,
         depth: bool = False,
+        channels: Sequence[Channel] = (),
+        mesh: MeshLayer | None = None,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
         """Draw a picture with what is resident; the arguments are those of
         `v3dg.render`."""
         check_camera(camera)
         subject = self._subject
         is_asset = isinstance(subject, Gaussians)
-        shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
+        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth)
+        shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
         cut_request = CutRequest(tolerance, budget, min_level, fade)
-        request = FrameRequest(camera, cut_request, shade, cut)
+        request = FrameRequest(camera, cut_request, shade, cut, sensor=sensor)
         return self._frame.chosen(subject).draw(subject, request, self._steps)
 
     def render_batch(
@@ -153,6 +159,8 @@ class Renderer:
         background: Sequence[float] = BLACK,
         min_transmittance: float | None = None,
         depth: bool = False,
+        channels: Sequence[Channel] = (),
+        mesh: MeshLayer | None = None,
         out: BatchPlanes | None = None,
     ) -> RenderedBatch:
         """Draw a picture for each of many cameras of one size by one call, with the
@@ -175,6 +183,9 @@ class Renderer:
             tolerance: As in `v3dg.select`; so are `min_level` and `fade`. A batch has
                 no budget.
             background: As in `v3dg.render`; so are `min_transmittance` and `depth`.
+            channels: As in `v3dg.render`; only on the CPU so far, as is `mesh`. New
+                arrays are made for them.
+            mesh: As in `v3dg.render`, with planes (B, H, W).
             out: Where to write; None for new arrays of colour, alpha and, if requested,
                 depth. They belong to the caller, and are valid once the result was read
                 or, on the same stream, once the buffers have their size.
@@ -185,9 +196,10 @@ class Renderer:
         """
         if not isinstance(cameras, CameraBatch):
             cameras = CameraBatch.of(cameras)
-        check_planes(out, with_depth=depth)
+        with_depth, sensor = sensor_of(channels, mesh, cameras, depth=depth)
+        check_planes(out, with_depth=with_depth)
         subject = self._subject
-        shade = shade_of(background, min_transmittance, is_asset=False, depth=depth)
+        shade = shade_of(background, min_transmittance, is_asset=False, depth=with_depth)
         cut = CutRequest(tolerance, None, min_level, fade)
         frame = self._frame.chosen(subject)
         if not isinstance(frame, SceneFrame):
@@ -195,7 +207,7 @@ class Renderer:
                 "renderer: a batch needs a scene or a bundle that is resident as a whole; "
                 "give memory=None"
             )
-        request = BatchRequest(cameras, cut, shade, out)
+        request = BatchRequest(cameras, cut, shade, out, sensor)
         batch = frame.draw_batch(subject, request)
         if not self._has_drawn_batch:
             batch.wait()

@@ -119,6 +119,7 @@ class FrameRequest(NamedTuple):
         shade: The background, and the transmittance at which pixels stop.
         selection: A cut that was selected earlier, which is drawn instead of `cut`.
         look: What the picture shows; None for the frame's own colours.
+        sensor: Channels beside colour, and meshes; None for neither.
     """
 
     camera: Camera | StereoCamera
@@ -126,6 +127,7 @@ class FrameRequest(NamedTuple):
     shade: _core.Shade
     selection: Selection | None = None
     look: Look | None = None
+    sensor: _core.Sensor | None = None
 
 
 def shade_of(

@@ -69,7 +69,7 @@ class SceneFrame:
         stop: _core.Stop | None = None,
     ) -> Picture:
         """Draw the requested cut."""
-        camera, cut, shade, selection, _ = request
+        camera, cut, shade, selection, _, sensor = request
         if selection is not None:
             if isinstance(camera, StereoCamera):
                 left, right = (
@@ -82,7 +82,7 @@ class SceneFrame:
             resident = residency.scene(subject, self.device, self._resident)
             self._resident = resident
             self.take(resident)
-            core_request = _core.FrameRequest(camera.core, rule, shade)
+            core_request = _core.FrameRequest(camera.core, rule, shade, None, None, sensor)
             drawing = self.core.draw(resident.core, core_request, None, steps, stop)
             resident.add_drawing(drawing)
 
@@ -134,7 +134,9 @@ class SceneFrame:
                 self._on_device(cut.instance_ids), self._on_device(cut.cluster_ids), weights
             )
             rule = CutRequest(cut.tolerance).rule
-            core_request = _core.FrameRequest(eye.core, rule, request.shade, pairs)
+            core_request = _core.FrameRequest(
+                eye.core, rule, request.shade, pairs, None, request.sensor
+            )
             drawing = self.core.draw(resident.core, core_request, None, None, stop)
             resident.add_drawing(drawing)
 

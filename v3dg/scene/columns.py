@@ -32,8 +32,11 @@ class Columns(NamedTuple):
     opacity: npt.NDArray[np.float32]
     tint: npt.NDArray[np.float32]
     environments: npt.NDArray[np.int32]
+    labels: npt.NDArray[np.int32]
 
 
+UNLABELLED = -1
+MOST_LABEL = (1 << 31) - 1
 SHARED = -1  # as an instance's environment: all cameras see it
 MOST_ENVIRONMENT = (1 << 24) - 1
 _ROW = {
@@ -64,6 +67,7 @@ def columns_of(
     opacity: npt.ArrayLike,
     tint: npt.ArrayLike,
     environment: npt.ArrayLike,
+    label: npt.ArrayLike,
 ) -> Columns:
     """Return checked columns; the number of positions is the number of instances."""
     points = _points_of(positions)
@@ -76,6 +80,7 @@ def columns_of(
         opacity=column(opacity, "opacity", count),
         tint=column(tint, "tint", count),
         environments=environment_column(environment, count),
+        labels=label_column(label, count),
     )
 
 
@@ -94,6 +99,7 @@ def composed(outer: Columns, inner: Columns) -> Columns:
             opacity=outer.opacity * inner.opacity,
             tint=outer.tint * inner.tint,
             environment=np.where(outer.environments < 0, inner.environments, outer.environments),
+            label=np.where(outer.labels < 0, inner.labels, outer.labels),
         )
 
 
@@ -181,15 +187,24 @@ def column(values: Array | None, name: str, count: int) -> Array:
 
 def environment_column(values: npt.ArrayLike, count: int) -> npt.NDArray[np.int32]:
     """Return the environments (count,) of instances; a single one stands for all."""
+    return _whole_column(values, "environment", count, SHARED, MOST_ENVIRONMENT)
+
+
+def label_column(values: npt.ArrayLike, count: int) -> npt.NDArray[np.int32]:
+    """Return the labels (count,) of instances; a single one stands for all."""
+    return _whole_column(values, "label", count, UNLABELLED, MOST_LABEL)
+
+
+def _whole_column(
+    values: npt.ArrayLike, name: str, count: int, low: int, high: int
+) -> npt.NDArray[np.int32]:
     array = np.asarray(values)
     expected = f"whole numbers, one for all or {count}"
     fits = array.dtype.kind in "iu" and array.shape in ((), (count,))
-    check("environment", fits, f"{expected}, got {array.dtype} of shape {array.shape}")
-    wrong = (array < SHARED) | (array > MOST_ENVIRONMENT)
+    check(name, fits, f"{expected}, got {array.dtype} of shape {array.shape}")
+    wrong = (array < low) | (array > high)
     if wrong.any():
-        raise ValueError(
-            f"environment: expected {SHARED} to {MOST_ENVIRONMENT}, got {array[wrong][0]}"
-        )
+        raise ValueError(f"{name}: expected {low} to {high}, got {array[wrong][0]}")
     return np.array(np.broadcast_to(array, count), np.int32)
 
 

@@ -19,7 +19,7 @@ from v3dg.cameras import DEFAULT_FOV_X, LENS_MODELS, Axis, Camera, LensModel, ch
 from v3dg.io import SUFFIXES
 from v3dg.rotations import normalised, product, similarity_of
 from v3dg.scene import Scene
-from v3dg.scene.columns import MOST_ENVIRONMENT, SHARED
+from v3dg.scene.columns import MOST_ENVIRONMENT, MOST_LABEL, SHARED, UNLABELLED
 from v3dg.scene.scene import turn_of
 
 FORMAT = "v3dg-scene"
@@ -48,6 +48,7 @@ class _Instance(NamedTuple):
     opacity: float
     tint: list[float]
     environment: int
+    label: int
     node: Node | None
 
 
@@ -232,6 +233,8 @@ def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]
         instances[number]["tint"] = scene.tint[number].tolist()
     for number in np.flatnonzero(scene.environments != SHARED).tolist():
         instances[number]["environment"] = scene.environments[number].item()
+    for number in np.flatnonzero(scene.labels != UNLABELLED).tolist():
+        instances[number]["label"] = scene.labels[number].item()
     return instances
 
 
@@ -281,7 +284,7 @@ def _subjects_of(
 
 
 _POSE = ("position", "quaternion", "scale")
-_FACTORS = ("importance", "opacity", "tint", "environment")
+_FACTORS = ("importance", "opacity", "tint", "environment", "label")
 
 
 def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
@@ -342,23 +345,23 @@ def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
                 opacity=instance.opacity,
                 tint=instance.tint,
                 environment=instance.environment,
+                label=instance.label,
             )
 
 
 def _add_bundles(scene: Scene, instances: Sequence[_Instance]) -> None:
     if not instances:
         return
-    columns = zip(*instances, strict=True)
-    subjects, positions, quaternions, scales, importance, opacity, tint, environment, _ = columns
     scene.add(
-        subjects,
-        positions,
-        quaternions,
-        scales,
-        importance,
-        opacity=opacity,
-        tint=tint,
-        environment=environment,
+        [cast(Bundle, instance.subject) for instance in instances],
+        [instance.position for instance in instances],
+        [instance.quaternion for instance in instances],
+        [instance.scale for instance in instances],
+        [instance.importance for instance in instances],
+        opacity=[instance.opacity for instance in instances],
+        tint=[instance.tint for instance in instances],
+        environment=[instance.environment for instance in instances],
+        label=[instance.label for instance in instances],
     )
 
 
@@ -382,7 +385,6 @@ def _instance(node: Node, subject: Bundle | Scene, fields: Mapping[str, Node]) -
     importance = 1.0
     opacity = 1.0
     tint = [1.0, 1.0, 1.0]
-    environment = SHARED
     if "matrix" in fields:
         position, quaternion, scale = _pose_of(fields["matrix"])
     if "position" in fields:
@@ -397,13 +399,13 @@ def _instance(node: Node, subject: Bundle | Scene, fields: Mapping[str, Node]) -
         opacity = _opacity(fields["opacity"])
     if "tint" in fields:
         tint = _tint(fields["tint"])
-    if "environment" in fields:
-        environment = _environment(fields["environment"])
+    environment = _whole(fields, "environment", SHARED, MOST_ENVIRONMENT)
+    label = _whole(fields, "label", UNLABELLED, MOST_LABEL)
     place: Node | None = None
     if isinstance(subject, Scene):
         place = node
     return _Instance(
-        subject, position, quaternion, scale, importance, opacity, tint, environment, place
+        subject, position, quaternion, scale, importance, opacity, tint, environment, label, place
     )
 
 
@@ -423,11 +425,15 @@ def _opacity(node: Node) -> float:
     return opacity
 
 
-def _environment(node: Node) -> int:
-    environment = node.number()
-    if environment != int(environment) or not SHARED <= environment <= MOST_ENVIRONMENT:
-        raise node.error(f"a whole number from {SHARED} to {MOST_ENVIRONMENT}")
-    return int(environment)
+def _whole(fields: Mapping[str, Node], name: str, low: int, high: int) -> int:
+    """Return a whole number from `low`, the default, to `high`."""
+    if name not in fields:
+        return low
+    node = fields[name]
+    number = node.number()
+    if number != int(number) or not low <= number <= high:
+        raise node.error(f"a whole number from {low} to {high}")
+    return int(number)
 
 
 def _tint(node: Node) -> list[float]:

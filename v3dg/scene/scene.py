@@ -17,12 +17,14 @@ from v3dg.gaussians import Array, Gaussians
 from v3dg.rotations import normalised, product, rotation_from_quaternion, turn_between
 from v3dg.scene.columns import (
     SHARED,
+    UNLABELLED,
     Columns,
     column,
     columns_of,
     composed,
     environment_column,
     joined,
+    label_column,
     on_device_of,
     parts_of,
     replaced,
@@ -47,6 +49,7 @@ class _State(NamedTuple):
     opacity: npt.NDArray[np.float32]
     tint: npt.NDArray[np.float32]
     environments: npt.NDArray[np.int32]
+    labels: npt.NDArray[np.int32]
     positions: Array  # poses are NumPy arrays, or tensors on a CUDA device
     quaternions: Array
     scales: Array
@@ -77,6 +80,7 @@ class Scene:
             opacity=np.zeros(0, np.float32),
             tint=np.zeros((0, 3), np.float32),
             environments=np.zeros(0, np.int32),
+            labels=np.zeros(0, np.int32),
             positions=np.zeros((0, 3)),
             quaternions=np.zeros((0, 4)),
             scales=np.zeros(0),
@@ -128,6 +132,7 @@ class Scene:
         opacity: npt.ArrayLike = 1.0,
         tint: npt.ArrayLike = (1.0, 1.0, 1.0),
         environment: npt.ArrayLike = SHARED,
+        label: npt.ArrayLike = UNLABELLED,
     ) -> range:
         """Add I instances of a bundle and return their ids.
 
@@ -154,6 +159,8 @@ class Scene:
             environment: (I,) or one whole number for all, 0 to 2^24 - 1: the cameras of
                 that environment see the instance (see `CameraBatch.environments`); -1:
                 those of all do. Pictures of a single `Camera` show all instances.
+            label: (I,) or one whole number for all, >= 0: what the channel `label` of a
+                picture shows, such as the class of the object; -1: none.
 
         Raises:
             TypeError: ``bundle`` is not a Bundle.
@@ -171,6 +178,7 @@ class Scene:
             opacity=opacity,
             tint=tint,
             environment=environment,
+            label=label,
         )
         count = len(rows.importance)
         if isinstance(bundle, list | tuple):
@@ -196,14 +204,15 @@ class Scene:
         opacity: float = 1.0,
         tint: npt.ArrayLike = (1.0, 1.0, 1.0),
         environment: int = SHARED,
+        label: int = UNLABELLED,
     ) -> range:
         """Add all instances of another scene, placed as a whole, and return their ids
         in this scene.
 
         Poses are composed; importance, opacity and tint are multiplied; an environment
-        replaces those of the other scene. Later changes of the other scene have no
-        effect. The arguments are those of `add` for one instance. If the other scene's
-        `up` is None, z is used.
+        and a label replace those of the other scene. Later changes of the other scene
+        have no effect. The arguments are those of `add` for one instance. If the other
+        scene's `up` is None, z is used.
 
         Raises:
             TypeError: ``scene`` is not a Scene.
@@ -220,14 +229,18 @@ class Scene:
         if matrix is not None:
             parts = parts_of(matrix, *parts)
         outer = columns_of(
-            *parts, importance=importance, opacity=opacity, tint=tint, environment=environment
+            *parts,
+            importance=importance,
+            opacity=opacity,
+            tint=tint,
+            environment=environment,
+            label=label,
         )
         count = len(outer.importance)
         check("scene", count == 1, f"one pose for the added scene, got {count} poses")
         inner = copy.copy(scene)  # other threads may change the original meanwhile
         if up is not None:
-            turned_quaternions = product(outer.quaternions, turn_of(inner, up))
-            outer = outer._replace(quaternions=turned_quaternions)
+            outer = outer._replace(quaternions=product(outer.quaternions, turn_of(inner, up)))
         bundles = [inner.bundles[number] for number in inner.instance_bundle]
         return self._append(bundles, composed(outer, _columns_of(inner)), up)
 
@@ -252,6 +265,7 @@ class Scene:
                 opacity=joined(state.opacity, rows.opacity),
                 tint=joined(state.tint, rows.tint),
                 environments=joined(state.environments, rows.environments),
+                labels=joined(state.labels, rows.labels),
             )
             self._publish(state, changes=1)
         return range(first, first + count)
@@ -268,6 +282,7 @@ class Scene:
                 opacity=state.opacity[is_left],
                 tint=state.tint[is_left],
                 environments=state.environments[is_left],
+                labels=state.labels[is_left],
                 positions=state.positions[on_device_of(state.positions, is_left)],
                 quaternions=state.quaternions[on_device_of(state.quaternions, is_left)],
                 scales=state.scales[on_device_of(state.scales, is_left)],
@@ -351,6 +366,15 @@ class Scene:
             environments[rows] = environment_column(environment, len(rows))
             self._publish(self._state._replace(environments=environments), changes=1)
 
+    def set_label(self, label: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
+        """Change the labels of instances (see `add`); of all instances if ``ids`` is
+        None."""
+        with _lock:
+            rows = self._ids(ids)
+            labels = self._state.labels.copy()
+            labels[rows] = label_column(label, len(rows))
+            self._publish(self._state._replace(labels=labels), changes=1)
+
     def set_tint(self, tint: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
         """Change the tint of instances (see `add`); of all instances if ``ids`` is
         None."""
@@ -430,6 +454,11 @@ class Scene:
         """(I,) int32, the environment of each instance, -1 for those of all; read-
         only."""
         return self._state.environments
+
+    @property
+    def labels(self) -> npt.NDArray[np.int32]:
+        """(I,) int32, the label of each instance, -1 for none; read-only."""
+        return self._state.labels
 
     @property
     def factors(self) -> npt.NDArray[np.float32] | None:
@@ -522,6 +551,7 @@ def _columns_of(scene: Scene) -> Columns:
         opacity=scene.opacity,
         tint=scene.tint,
         environments=scene.environments,
+        labels=scene.labels,
     )
 
 

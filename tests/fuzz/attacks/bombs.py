@@ -1,5 +1,5 @@
-"""Small files that would cost much to read: each gives a `Good` that is none, and what
-must become of it."""
+"""Small files that would be expensive to read. Each function returns an invalid `Good`,
+and the expected outcome."""
 
 import functools
 import gzip
@@ -36,7 +36,8 @@ def constant_webp(side):
 
 @functools.cache
 def constant_png(width, height, mode=6):
-    """Zeros, packed row by row, so that making it costs no memory."""
+    """Return zeros that are packed row by row, so that creating them takes no
+    memory."""
 
     def chunk(name, body):
         return (
@@ -57,8 +58,8 @@ def small_sog():
 
 
 def sog_of_large_pictures(rng):
-    """Constant pictures cost few bytes and many pixels; padding makes a file look as if
-    it justified them."""
+    """Constant pictures have few bytes and many pixels. Padding makes a file look large
+    enough for them."""
     side = rng.choice((2048, 3000, 4096))
     picture = rng.choice((constant_webp, lambda side: constant_png(side, side)))(side)
     files = dict(small_sog())
@@ -97,7 +98,7 @@ def sog_of_many_entries(rng):
 
 
 def streamed_with_repeated_names(rng):
-    """One folder, named again and again; of constant pictures, or small."""
+    """One folder is named many times; its pictures are constant, or small."""
     good = streamed(0, names=["0/meta.json"] * rng.choice((300, 3000, 20_000)))
     side = rng.choice((0, 250, 2000))
     if not side:
@@ -122,7 +123,7 @@ def streamed_with_deep_tree(rng):
 
 
 def streamed_with_overlapping_runs(rng):
-    """Leaves that all name the same gaussians."""
+    """All leaves name the same gaussians."""
     good = streamed(1)
     index = json.loads(good.content)
     index["tree"]["children"] *= rng.choice((40, 5000))
@@ -142,13 +143,13 @@ def spz_of_zeros(rng):
 
 
 def spz_with_a_long_tail(rng):
-    """Few gaussians, and much after them."""
+    """The file has few gaussians, followed by much data."""
     good = gzip.decompress((FIXTURES / "sh0_v3.spz").read_bytes())
     return "spz", {"a.spz": gzip.compress(good + bytes(rng.choice((1 << 20, 1 << 26))), 9, mtime=0)}
 
 
 def spz_of_long_frames(rng):
-    """zstd packs zeros better than any deflate."""
+    """zstd compresses zeros better than any deflate."""
     import zstandard
 
     count, streams = rng.choice((1 << 16, 1 << 22)), []
@@ -189,12 +190,13 @@ def _tensors(rng, count=None):
 
 
 def checkpoint_of_expanded_tensors(rng):
-    """One number in the file, and a tensor of a billion that is made of it."""
+    """The file contains one number, and a tensor of a billion elements that all refer
+    to it."""
     return "checkpoint", {"a.pt": checkpoint_bytes(_tensors(rng))}
 
 
 def checkpoint_of_overlapping_tensors(rng):
-    """Every number of the file stands in each tensor, and in many places of it."""
+    """Every number of the file is in each tensor, and at many places of it."""
     tensors, base = _tensors(rng, 1 << 18), torch.rand((1 << 18) + 64)
     for name in rng.sample(list(tensors), rng.randrange(1, 7)):
         tensors[name] = base.as_strided(tensors[name].shape, [1] * tensors[name].ndim)
@@ -227,7 +229,7 @@ def checkpoint_of_odd_tensors(rng):
 
 
 def checkpoint_with_a_long_pickle(rng):
-    """A pickle of one thing many times, deflated."""
+    """Return a compressed pickle that contains the same item many times."""
     entries = [(e.filename, c) for e, c in zip_entries(checkpoint_bytes(_tensors(rng, 3)))]
     num = rng.choice((1 << 20, 1 << 24, 1 << 26))
     body = rng.choice(
@@ -275,7 +277,7 @@ def scene_of_bundles_in_turn(rng):
 
 
 def scene_of_many_bundles(rng):
-    """One file by thousands of names."""
+    """The scene names one file by thousands of names."""
     names = {f"b{i}": rng.choice(("a.v3dg", "./a.v3dg")) for i in range(rng.choice((500, 5000)))}
     instances = [{"bundle": name, "position": [0, 0, 0]} for name in names]
     document = {"format": "v3dg-scene", "version": 1, "bundles": names, "instances": instances}
@@ -319,8 +321,7 @@ def picture_that_claims(rng):
 
 
 def picture_of_another_program(rng):
-    """What Pillow hands on to other programs, or reads with plugins that nobody asked
-    for."""
+    """These are files that Pillow passes to other programs, or reads with plugins."""
     eps = (
         b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
         b"0 0 8 8 rectfill showpage\n%%EOF\n"
@@ -366,7 +367,7 @@ BOMBS = (
 
 
 def written_with_constants(rng, folder):
-    """What we write must be read back, however much of it is the same everywhere."""
+    """Assets that are largely constant must be read back after they were written."""
     count, degree = rng.choice((1, 2, 300, 20_000, 70_000)), rng.choice((0, 0, 1))
     asset = random_gaussians(np.random.default_rng(rng.getrandbits(32)), count, degree)
     for name in rng.sample(("means", "quats", "scales", "opacities", "sh"), rng.randrange(6)):

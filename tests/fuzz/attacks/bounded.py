@@ -1,5 +1,5 @@
-"""SIGKILL at random moments of a build of several files that do not fit in memory; as
-kills.py for the rest.
+"""SIGKILL at random moments of a build of several files that do not fit in memory,
+otherwise like kills.py.
 
 The file is not there, as it was, or whole, and a build that goes on gives the bytes of
 one that ran through. The program tells itself that memory is small, and units with it:

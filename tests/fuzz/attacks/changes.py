@@ -1,4 +1,4 @@
-"""Changes of files: of bytes, and of what is packed in a stream or a zip."""
+"""Changes of files: of bytes, and of the content of a compressed stream or a zip."""
 
 import gzip
 import re
@@ -76,7 +76,7 @@ def grown(data, rng, _):
 
 def flipped(data, rng, _):
     out = bytearray(data)
-    # Headers are where most is decided.
+    # Most decisions depend on the header.
     reach = rng.choice((len(out), min(len(out), 64), min(len(out), 512)))
     for _ in range(rng.choice((1, 1, 2, 8, 64)) if out else 0):
         out[rng.randrange(reach)] ^= 1 << rng.randrange(8)
@@ -94,7 +94,7 @@ def overwritten(data, rng, _):
 
 
 def numbers_changed(data, rng, _):
-    """Whole numbers and floats in the places that they often have, set to extremes or
+    """Integers and floats at the usual places are replaced by extremes or
     multiplied."""
     out = bytearray(data)
     reach = rng.choice((len(out), min(len(out), 64), min(len(out), 512)))
@@ -128,7 +128,7 @@ def pieces_moved(data, rng, _):
 
 def spliced(data, rng, other):
     cut, other_cut = rng.randrange(len(data) + 1), rng.randrange(len(other) + 1)
-    if rng.random() < 0.5:  # a header and another's body
+    if rng.random() < 0.5:  # the header of one file and the body of another
         cut = rng.choice((4, 8, 16, 64, 512)) % (len(data) + 1)
         other_cut = min(cut, len(other))
     return data[:cut] + other[other_cut:]
@@ -142,7 +142,8 @@ def bytes_changed(data, rng, other):
 
 
 def words_changed(data, rng, _):
-    """Numbers and lines of a text, as a .ply's header is."""
+    """Numbers and lines of a text are changed, for example of the header of a .ply
+    file."""
     lines = data.split(b"\n")
     end = next(
         (i for i, line in enumerate(lines) if line.startswith(b"end_header")), len(lines) - 1
@@ -174,7 +175,7 @@ def document_changed(data, rng, _):
 
 
 def stream_changed(data, rng, other):
-    """What is in a gzip stream, packed again."""
+    """The content of a gzip stream is changed and compressed again."""
     try:
         body = gzip.decompress(data)
     except (OSError, EOFError, zlib.error):
@@ -183,7 +184,7 @@ def stream_changed(data, rng, other):
 
 
 def zip_changed(data, rng, other):
-    """The entries of a zip, or what its tables say of them."""
+    """The entries of a zip are changed, or what its tables say about them."""
     entries = [(entry.filename, content) for entry, content in zip_entries(data)]
     i = rng.randrange(len(entries))
     name, content = entries[i]
@@ -218,10 +219,10 @@ def zip_changed(data, rng, other):
 
 
 def tables_changed(data, rng):
-    """Sizes, CRCs, methods and places in the headers of a zip's entries and in its
-    directory."""
+    """Sizes, CRCs, methods and places are changed in the headers of a zip's entries and
+    in its directory."""
     out = bytearray(data)
-    # Signature: places and sizes of the fields after it.
+    # A signature, and the places and sizes of the fields after it.
     fields = {
         b"PK\1\2": (
             (6, 2),
@@ -250,7 +251,8 @@ def tables_changed(data, rng):
 
 
 def bundle_changed(data, rng, other):
-    """The header as a document or numbers in the tables, with hashes that fit."""
+    """The header is changed as a document, or numbers in the tables are changed; the
+    hashes are correct."""
     parts = parts_of(data)
     _, start, pages_end, hash_end = parts
     if rng.random() < 0.5:
@@ -270,7 +272,7 @@ def bundle_changed(data, rng, other):
     return with_fitting_hashes(data)
 
 
-# What else may happen to a kind beside changes of its bytes.
+# Further changes of each kind of file, besides changes of its bytes.
 OWN = {
     "ply": words_changed,
     "compressed": words_changed,

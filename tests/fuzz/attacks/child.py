@@ -28,7 +28,7 @@ def main():
         print(module.LIMIT_S)
         return
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # whatever else is printed
+    os.dup2(2, 1)  # other output is not mixed with it
     work = Path(work[0])
     attack = module.Attack(Path(shared))
     for line in sys.stdin:

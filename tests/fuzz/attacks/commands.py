@@ -1,5 +1,5 @@
-"""Random command lines: each ends by itself, with 0, or with 1 or 2 and one line that
-says why."""
+"""Random command lines: each ends by itself with exit code 0, or with 1 or 2 and one
+line that gives the reason."""
 
 import os
 import signal
@@ -9,7 +9,7 @@ import time
 from fuzz.attacks.program import copied, documents, fault_of, is_running, make_files, outcome, run
 
 LIMIT_S = 150
-LONG_S = 60  # no command here has so much to do
+LONG_S = 60  # all commands here are small
 
 NUMBERS = (
     "0",
@@ -117,7 +117,7 @@ OUTPUTS += (
     "",
     "o" * 300 + ".ply",
 )
-# Options and whether they take a number, a word, a path, or nothing.
+# Options, and whether they take a number, a word, a path, or nothing.
 VIEWS = {
     "--cameras": "p",
     "--distortion": "w",
@@ -286,7 +286,7 @@ def _arguments(rng, command):
     kinds = {**OPTIONS[command], **COMMON}
     if rng.random() < 0.9:
         kinds = {name: kinds[name] for name in kinds if name not in LACKING.get(command, ())}
-    # Small, unless asked otherwise.
+    # Outputs are small unless a size was chosen.
     if command in ("demo", "render", "compare") and "b.png" not in arguments:
         arguments += (
             ["--size", "24", "20"]
@@ -320,7 +320,7 @@ def _arguments(rng, command):
 
 
 def _change_outputs(rng, work, arguments):
-    """What is written over keeps who may read it."""
+    """Check that an overwritten file keeps its permissions."""
     modes = {}
     for name in set(arguments) & set(OUTPUTS[:7]):
         mode = rng.choice((0o600, 0o640, 0o666))
@@ -331,8 +331,8 @@ def _change_outputs(rng, work, arguments):
 
 
 def _interrupt_server(process, out):
-    """When it says where it listens; where its stdout leads nowhere, when it has had
-    the time to."""
+    """Interrupt it when it has printed its address; if its stdout leads nowhere, after
+    the time that this takes."""
     end = time.monotonic() + 10
     while is_running(process) and time.monotonic() < end and b"http://" not in out.read_bytes():
         time.sleep(0.02)

@@ -1,5 +1,5 @@
-"""Damage that must be noticed, and odd files that must be read: what other programs
-write, or break."""
+"""Damage that must be detected, and unusual files that must be read: as other programs
+write or break them."""
 
 import functools
 import io
@@ -18,8 +18,8 @@ from v3dg.formats import sog
 
 
 def damaged(rng):
-    """Kind, what was done, files, what becomes of them ("read", "refused", "any"), and
-    with which arrays."""
+    """Return the kind, the change, the files, the expected outcome ("read", "refused"
+    or "any"), and the expected arrays."""
     make = rng.choice(DAMAGES)
     kind, files, must, *arrays = make(rng)
     return kind, make.__name__, files, must, arrays[0] if arrays else None
@@ -32,7 +32,7 @@ def _asset():
 
 @functools.cache
 def _checkpoint():
-    """A checkpoint, and what reading it gives."""
+    """Return a checkpoint, and the result of reading it."""
     import tempfile
     from pathlib import Path
 
@@ -54,7 +54,7 @@ def _with_entries(change, compression=0):
 
 
 def storage_cut_short(rng):
-    """A tensor's storage of fewer bytes than its numbers take."""
+    """A tensor's storage has fewer bytes than its numbers need."""
     number, share = rng.randrange(5), rng.random()
 
     def cut(name, content):
@@ -95,7 +95,7 @@ def zipped_anew(_):
 
 
 def storage_changed(rng):
-    """A byte of the numbers, which only the CRC tells."""
+    """A byte of the numbers is changed, which only the CRC detects."""
     content = bytearray(_checkpoint()[0])
     entry = rng.choice([e for e, c in zip_entries(bytes(content)) if "/data/" in e.filename and c])
     name_bytes, extra = struct.unpack_from("<HH", content, entry.header_offset + 26)
@@ -111,7 +111,7 @@ def written_as_before_zips(rng):
 
 
 def storage_shared(_):
-    """Two tensors of one storage, as trainers save them, are fine."""
+    """Two tensors with one storage are valid, and trainers save such files."""
     tensors = gsplat_tensors(_asset())
     sh = torch.cat([tensors["sh0"], tensors["shN"]], 1)
     tensors |= {"sh0": sh[:, :1], "shN": sh[:, 1:]}
@@ -132,8 +132,8 @@ def _compressed_without(names):
 
 
 def bounds_missing(rng):
-    """Some, not all, of a compressed .ply's bounds of colours, or one of its positions
-    or scales."""
+    """Some bounds of colours, or one of positions or scales, are missing from a
+    compressed .ply file."""
     colors = [f"{end}_{axis}" for end in ("min", "max") for axis in "rgb"]
     others = [
         f"{end}{kind}_{axis}" for end in ("min", "max") for kind in ("", "_scale") for axis in "xyz"
@@ -143,7 +143,7 @@ def bounds_missing(rng):
 
 
 def colors_without_bounds(_):
-    """Older files have none."""
+    """Older files have no bounds of colours."""
     names = [f"{end}_{axis}" for end in ("min", "max") for axis in "rgb"]
     return "compressed", _compressed_without(names), "read"
 
@@ -161,7 +161,7 @@ def filenames_missing(rng):
 
 
 def picture_of_another_sog(rng):
-    """A file of another size, mode or kind under a picture's name."""
+    """A picture is replaced by a file of another size, mode or kind."""
     files = dict(sog.encode(_asset()))
     from PIL import Image
 
@@ -185,7 +185,7 @@ def picture_of_another_sog(rng):
 
 
 def value_of_another_type(rng):
-    """Each field of a SOG's meta.json in turn."""
+    """Each field of a SOG's meta.json gets a value of another type in turn."""
     files = dict(sog.encode(_asset()))
     meta = json.loads(files["meta.json"])
     holder, key = rng.choice(

@@ -16,7 +16,7 @@ import threading
 import time
 
 if __name__ == "__main__":
-    # Handlers run in reverse: this one after all of the package's.
+    # Handlers run in reverse order, so this one runs after all handlers of the package.
     atexit.register(lambda: draw_last())
 
 import numpy as np
@@ -87,7 +87,7 @@ def pools_of_renderers():
 
 
 def pool_of_url():
-    """Threads of a pool that Python did not start call functions of Python."""
+    """Threads of a pool, which Python did not start, call functions of Python."""
     for k in itertools.count():
         renderer = v3dg.Renderer(v3dg.open("memory://in/a.v3dg"), device="cpu", memory=MEMORY)
         for camera in CAMERAS[k % 8 :: 3]:
@@ -101,7 +101,7 @@ def pick():
 
 
 def viewer():
-    """A tab of a viewer that draws one picture after the other."""
+    """A tab of a viewer draws one picture after another."""
     from dataclasses import replace
 
     from v3dg.viewer.server import start_view
@@ -133,7 +133,8 @@ kept = []
 
 
 def go_on(name, has_begun=None):
-    with contextlib.suppress(ImportError):  # nothing more is loaded once the interpreter ends
+    # Once the interpreter ends, nothing can be loaded any more.
+    with contextlib.suppress(ImportError):
         for done in WORK[name]():
             kept[1:] = [done]
             if has_begun is not None:
@@ -141,7 +142,7 @@ def go_on(name, has_begun=None):
 
 
 def started(name, count):
-    """Threads at work, each of which has done something."""
+    """Return threads at work, each of which has finished something."""
     has_begun = threading.Semaphore(0)
     for _ in range(count):
         threading.Thread(target=go_on, args=(name, has_begun), daemon=True).start()
@@ -164,14 +165,13 @@ def render_once():
 
 
 def end(how, work, gap):
-    """End in a way; what returns from here is followed by the end of the main
-    module."""
+    """End in one of the ways. If this returns, the main module ends next."""
     if how == "handler renders":
         atexit.register(render_once)
     if how == "handler starts threads":
 
         def start():
-            # Since Python 3.12 there are no threads any more.
+            # Since Python 3.12, no thread can be started then.
             with contextlib.suppress(RuntimeError):
                 threading.Thread(target=go_on, args=(work,), daemon=True).start()
                 time.sleep(gap)

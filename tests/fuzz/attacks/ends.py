@@ -1,5 +1,5 @@
-"""Programs that end in every way while daemon threads are in every call: with the right
-code, and soon."""
+"""Programs that end in every way while daemon threads are in all kinds of calls: with
+the right exit code, and soon."""
 
 import re
 import signal
@@ -16,10 +16,10 @@ from fuzz.attacks.program import copied, outcome, run
 from random_bundle import random_gaussians
 
 LIMIT_S = 120
-SOON_S = 15  # on a machine with much else to do
+SOON_S = 15  # on a busy machine
 PROGRAM = [sys.executable, str(Path(__file__).with_name("ending_program.py"))]
-# Exit codes by how a program ends. An interrupt that comes in an exit handler is
-# printed and forgotten.
+# Exit codes by the way in which a program ends. An interrupt in an exit handler is
+# printed and ignored.
 ENDINGS = {
     "return": {0},
     "sys.exit": {3},
@@ -69,9 +69,9 @@ class Attack:
 
 
 def ended(folder, work, ending, num_threads, seconds, gap):
-    """The outcome of a program in a folder with the files of `prepare`."""
+    """Return the outcome of a program in a folder with the files of `prepare`."""
     arguments = [work, ending, str(num_threads), str(seconds), str(gap)]
-    # Threads of OpenMP work while the program ends, too.
+    # Threads of OpenMP also work while the program ends.
     several = environment() | {"OMP_NUM_THREADS": "2"}
     end = run(arguments, folder, program=PROGRAM, limit_s=60, environment=several)
     now = time.monotonic()

@@ -89,7 +89,7 @@ def prepare(shared):
 
 
 def snapshot(folder):
-    """What each name below a folder stands for, following no link."""
+    """Return what each name below a folder is, without following links."""
     entries = {}
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -154,8 +154,7 @@ class Attack:
         return what, do
 
     def _subject(self, rng, work, folder):
-        """What is exported, in a folder of its own or in the one that is exported
-        to."""
+        """Return what is exported; it is in its own folder or in the output folder."""
         (work / "cwd").mkdir()
         place = folder / rng.choice(("", "0_0", "data")) if rng.random() < 0.1 else work / "input"
         place.mkdir(parents=True, exist_ok=True)
@@ -164,8 +163,8 @@ class Attack:
         return place / rng.choice(("a.v3dg", "b.v3dg", "town.json"))
 
     def _fill(self, rng, work, folder):
-        """Put things into the folder; returns what exports wrote and nobody changed, by
-        name."""
+        """Put files into the folder; return those that exports wrote and nobody
+        changed, by name."""
         if rng.random() < 0.1 and not folder.exists():
             return {}
         recorded = {}
@@ -209,7 +208,7 @@ class Attack:
             os.symlink(rng.choice(targets), path)
 
     def _put_other_name(self, rng, work, folder):
-        """A hard link: to a file elsewhere, or elsewhere to a file here."""
+        """Add a hard link: to a file elsewhere, or elsewhere to a file here."""
         with contextlib.suppress(OSError):
             path = folder / rng.choice(NAMES)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -231,7 +230,7 @@ class Attack:
                 rng.choice((lambda p: p.write_text("changed"), Path.unlink))(path)
 
     def _tamper(self, rng, work, folder):
-        """Change or make the record; returns the names that it may claim."""
+        """Change or create the record; return the names that it may list."""
         path = folder / RECORD
         if path.is_symlink() or path.is_dir() or (path.exists() and not path.is_file()):
             return set()
@@ -251,7 +250,7 @@ class Attack:
             record["files"][name] = _claim(b"outside 0")
         elif act == 2:
             record["folders"].append(rng.choice((*LEADING_OUT, str(work / "outside" / "deep"))))
-        elif act == 3:  # of another content
+        elif act == 3:  # with another content
             record["files"]["data/cities.json"] = _claim(b"of another city")
             record["folders"].append("data")
         else:
@@ -262,7 +261,8 @@ class Attack:
         return {"data/towns.json", "data"} if act == 4 else set()
 
     def _put_hidden(self, rng, work, folder):
-        """What looks as if an export had been killed, and leads elsewhere."""
+        """Add what looks like the remains of a killed export, and refers to another
+        place."""
         hidden = folder / f".v3dg-export.{rng.randrange(1 << 64):016x}.tmp"
         act = rng.randrange(4)
         if act == 0:
@@ -292,7 +292,7 @@ class Attack:
         return (folder, Path("../project"), folder / "." / ".." / "project")[way - 1]
 
     def _reference(self, kind, subject, work):
-        """What an export into a new folder has, by name."""
+        """Return the files of an export into a new folder, by name."""
         key = kind, subject.name
         if key not in self._references:
             place = work.parent / f"{work.name}_{kind}_{subject.stem}"
@@ -316,13 +316,14 @@ def _claim(content):
 
 
 def _export(way, kind, subject, output, overwrite, moment):
-    """The error of an export, or None."""
+    """Return the error of an export, or None."""
     more = {"overwrite": True} if overwrite else {}
     if way == "command":
         said = io.StringIO()
         arguments = ["export", str(subject), "-o", str(output), "--quiet"]
         arguments += ["--to", "tiles"] if kind == "tiles" else []
-        # `export` has the page with streamed SOG; its other kind is a function alone.
+        # `export` writes the page with streamed SOG; its other kind is a separate
+        # function.
         if kind != "sog":
             arguments += ["--overwrite"] if overwrite else []
             with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
@@ -348,7 +349,7 @@ def _export(way, kind, subject, output, overwrite, moment):
 
 @contextlib.contextmanager
 def _stopped(way, moment):
-    """Have a move fail, or be interrupted once it is done."""
+    """Make a move fail, or interrupt it after it was done."""
     rename, count = os.rename, 0
 
     def moved(*arguments, **options):
@@ -368,8 +369,8 @@ def _stopped(way, moment):
 
 
 def fault_of(before, after, recorded, written, error, overwrite):
-    """What is wrong with all that is below the work folder after an export, which may
-    have ended or not."""
+    """Return the fault in everything below the work folder after an export that may or
+    may not have ended."""
     files = {name: entry for name, entry in written.items() if is_file(entry) and name != RECORD}
     missing = [
         name
@@ -388,7 +389,7 @@ def fault_of(before, after, recorded, written, error, overwrite):
 
 
 def fault_of_changes(before, after, recorded, written, overwrite):
-    """Whether anything of others was touched, or anything is new that is not of the
+    """Return whether other files were changed, or new files are not those of the
     export."""
     for path in _differs(before, after):
         name = path.removeprefix("project/") if path.startswith("project/") else None

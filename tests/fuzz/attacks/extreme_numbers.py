@@ -29,7 +29,7 @@ EXTREMES = (0.0, -0.0, 1e-45, 1e-38, 3e-23, 1e-20, 1e-10, 1e10, 1.8e19, 1e20, 1e
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 NAMES = ("means", "quats", "scales", "opacities", "sh")
 MODES = ({}, {"filter_px2": 0.3}, {"filter_px2": 0.3, "antialiased": True})
-# Pictures are so small that the mean of a few pixels is no bound of its own.
+# Pictures are so small that the mean over a few pixels would be no separate bound.
 BOUND = dataclasses.replace(PICTURE_FLOAT, mean=PICTURE_FLOAT.absolute)
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
@@ -62,8 +62,8 @@ class Attack:
 
 
 class Other:
-    """A process that chooses cuts with another instruction set; none where the machine
-    lacks that."""
+    """A process that selects cuts with another instruction set; None if the machine
+    lacks it."""
 
     def __init__(self, name):
         self.name = name
@@ -90,7 +90,7 @@ def answer_with_digests():
 
 
 def camera_of(rng):
-    """A camera somewhere near the origin, of any focal length that a picture can
+    """Return a camera near the origin, with any focal length that a picture can
     have."""
     eye = rng.normal(size=3) * 3
     width = int(rng.integers(1, 40))
@@ -102,7 +102,7 @@ def camera_of(rng):
 
 
 def usual_arrays(rng, count, camera):
-    """Gaussians in front of the camera, as (N, ...) arrays of doubles."""
+    """Return gaussians in front of the camera, as (N, ...) arrays of doubles."""
     to_world = camera.viewmat[:3, :3].T
     slopes = rng.uniform(-0.6, 0.6, (count, 2)) * [
         camera.width / camera.fx,
@@ -126,8 +126,8 @@ def gaussians_of(arrays):
 
 
 def extreme_fault(seed):
-    """What is not finite in a picture of gaussians with extreme values, or in its
-    gradients."""
+    """Return what is not finite in a picture of gaussians with extreme values, or in
+    its gradients."""
     rng = np.random.default_rng(seed)
     camera = camera_of(rng)
     arrays = usual_arrays(rng, 50, camera)
@@ -148,7 +148,7 @@ def extreme_fault(seed):
     if not ((image.alpha >= 0) & (image.alpha <= 1)).all():
         return "alpha: expected values from 0 to 1, got others"
     if "sh" in changed or "scales" in changed:
-        return None  # gradients are in proportion to these, and may be beyond float32
+        return None  # gradients are proportional to these, and may exceed float32
     (image.color.sum() + image.alpha.sum()).backward()
     for name, tensor in tensors.items():
         if torch.isnan(tensor.grad).any():
@@ -157,8 +157,8 @@ def extreme_fault(seed):
 
 
 def reference_fault(seed):
-    """How a picture of gaussians over many decades differs from the float64
-    reference's."""
+    """Return how a picture of gaussians over many decades differs from the float64
+    reference."""
     rng = np.random.default_rng(seed)
     camera = camera_of(rng)
     arrays = usual_arrays(rng, 30, camera)
@@ -180,7 +180,8 @@ def reference_fault(seed):
 
 
 def cut_digest(seed):
-    """Of the cut of a scene whose poses, tolerance and camera span many decades."""
+    """Return the digest of a cut of a scene whose poses, tolerance and camera span many
+    decades."""
     rng = np.random.default_rng(seed)
     scene = v3dg.Scene()
     size = 10.0 ** rng.uniform(-12, 12)

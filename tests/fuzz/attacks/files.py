@@ -26,14 +26,15 @@ from v3dg.camera_file import CameraWarning
 from v3dg.cleaning import AssetWarning
 from v3dg.cli import main
 
-LIMIT_S = 60  # a hang
-# The bounds of docs/robustness.md, beyond what was held before: MB, and bytes for each
-# byte on the disk, gaussian and byte of JSON; of a picture that is compared, for each
-# pixel.
+LIMIT_S = 60  # longer is a hang
+# The bounds in docs/robustness.md on memory beyond what was used before: MB, bytes per
+# byte on disk, per gaussian and per byte of JSON, and per pixel of a compared picture.
 MOST_MB, A_BYTE, A_GAUSSIAN, A_BYTE_OF_JSON, A_PIXEL = 100, 8, 400, 40, 250
-BELIEVED = 1 << 18  # gaussians of a file of any size; beyond them one for each of its bytes
-# Seconds of one core, which other work on the machine makes slower: and for each
-# million bytes and gaussians.
+# The number of gaussians in a file of any size. Larger files may have one for each of
+# their bytes.
+BELIEVED = 1 << 18
+# Seconds on one core, which other work on the machine slows down, and seconds per
+# million bytes and per million gaussians.
 MOST_SECONDS, A_MILLION = 5, 3
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -43,7 +44,7 @@ def prepare(shared):
 
 
 def _put_ghostscript(folder):
-    """One that tells that it was started, before any other on the path."""
+    """Put a program called gs that records its start first on PATH."""
     program = folder / "gs"
     program.write_text(f"#!/bin/sh\ntouch {folder}/was_started\necho 10.0\n")
     program.chmod(0o755)
@@ -52,7 +53,7 @@ def _put_ghostscript(folder):
 
 
 def compare_picture(path):
-    """With the one beside it."""
+    """Compare the picture with the one beside it."""
     said = io.StringIO()
     beside = path.with_name("b.png")
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
@@ -105,13 +106,13 @@ class Attack:
         self._good = good_files(own)
         self._started = _put_ghostscript(own)
         self._arrays, self._num_calls = {}, {}
-        for kind in self._good:  # what is imported late is imported here
+        for kind in self._good:  # modules that are imported late are imported here
             self._known(kind, 0, own)
         torch.set_num_threads(1)
         limit_growth(6 << 30)
 
     def _known(self, kind, index, folder):
-        """What a good file holds."""
+        """Return the content of a valid file."""
         if (kind, index) not in self._arrays:
             good = self._good[kind][index]
             self._arrays[kind, index] = _reader(kind)(_put(folder / f"{kind}_{index}", good.files))
@@ -143,7 +144,7 @@ class Attack:
         own = changes.OWN.get(kind, changes.bytes_changed)
         change = own if rng.random() < 0.5 else rng.choice(changes.BYTES)
         files = good.files
-        if len(files) > 1 and rng.random() < 0.3:  # what lies beside it
+        if len(files) > 1 and rng.random() < 0.3:  # the files beside it
             name = rng.choice(list(files)[1:])
             files = {**files, name: changes.bytes_changed(files[name], rng, other)}
             if rng.random() < 0.2:
@@ -155,7 +156,7 @@ class Attack:
             changes.truncated,
             changes.overwritten,
         )
-        if rng.random() < 0.03:  # by a name of another kind
+        if rng.random() < 0.03:  # with a name of another kind
             name = rng.choice(
                 (
                     "a.ply",
@@ -215,12 +216,11 @@ class Attack:
         return do
 
     def _while_it_is_changed(self, rng, kind, index, work):
-        """At one of the calls that reading makes, the file is cut, grown, written to,
-        replaced or removed."""
+        """At one of the calls of the reader, the file is truncated, extended,
+        overwritten, replaced or removed."""
         good = self._good[kind][index]
         path = _put(work, good.files)
-        # What stands there afterwards may be a pipe, which our own look at its size
-        # would wait for.
+        # The name may then be a pipe, and looking at its size would wait.
         read = compare_picture if kind == "picture" else _reader(kind)
         if (kind, index) not in self._num_calls:
             with _at_call(None, lambda: None) as calls:
@@ -254,8 +254,7 @@ class Attack:
 
 @contextlib.contextmanager
 def _at_call(number, action):
-    """Does something at the call of that number, of those that follow, in Python or
-    from it."""
+    """Run an action at the call with this number, in Python or from Python."""
     calls = [0]
 
     def count(*_):
@@ -283,10 +282,11 @@ def _put(folder, files):
 
 
 def _tried(read, path):
-    """What was read or None, the error's text, and what is wrong with that."""
+    """Return what was read or None, the text of the error, and what is wrong with
+    it."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", AssetWarning)  # notes about what is not read
+        warnings.simplefilter("ignore", AssetWarning)  # notes about content that is not read
         warnings.simplefilter("ignore", CameraWarning)  # and about images that are left out
         try:
             return read(path), "", None

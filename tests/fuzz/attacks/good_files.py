@@ -1,5 +1,5 @@
-"""One small good file of each kind that is read, to be changed: its place, and what
-else lies beside it."""
+"""One small valid file of each kind that is read, to be changed: its path, and the
+files beside it."""
 
 import dataclasses
 import io
@@ -23,12 +23,12 @@ from v3dg.formats import sog
 
 @dataclasses.dataclass(frozen=True)
 class Good:
-    """Files by their path, of which the first is read."""
+    """Files by their paths; the first one is read."""
 
     kind: str
     files: dict
-    # What detects every change of its bytes: no other content may come of them than
-    # what was there.
+    # Formats that detect every change of their bytes: only the original content may be
+    # read.
     is_hashed: bool = False
 
     @property
@@ -44,7 +44,7 @@ class Good:
 
 
 def good_files(folder):
-    """Some of each kind, by the kind."""
+    """Return some files of each kind, by the kind."""
     made = {}
     for good in (
         *_ply(),
@@ -68,7 +68,8 @@ def _ply():
 
 
 def _of_another_trainer(degree):
-    """Base colours, flat gaussians, filters and numbers of other types."""
+    """Return files with base colours, flat gaussians, filters and numbers of other
+    types."""
     columns = random_columns(5, degree)
     for i, name in enumerate(("red", "green", "blue")):
         del columns[f"f_dc_{i}"]
@@ -111,7 +112,7 @@ def _formats(folder):
 
 
 def streamed(num_folders, names=None, **more):
-    """Streamed SOG of folders of 40 gaussians, a leaf each."""
+    """Return a streamed SOG with folders of 40 gaussians, one leaf each."""
     parts = sog.encode(random_gaussians(np.random.default_rng(2), 40, 0))
     names = names or [f"{i}/meta.json" for i in range(num_folders)]
     box = {"min": [-9.0] * 3, "max": [9.0] * 3}
@@ -192,7 +193,7 @@ CAMERA_OF_3DGS = {
 
 
 def _models_of_colmap():
-    """Two images of one camera, binary and as text."""
+    """Return models with two images of one camera, binary and as text."""
     lens = struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50, 50, 32, 24)
     image = struct.pack("<7dI", 1, 0, 0, 0, 0, 0, 5, 1) + b"a b.jpg\0" + bytes(8)
     images = struct.pack("<QI", 2, 1) + image + struct.pack("<I", 2) + image
@@ -202,7 +203,7 @@ def _models_of_colmap():
 
 
 def _documents():
-    """Three scenes and two camera files, of each kind that is read."""
+    """Return three scenes and two camera files, one of each kind that is read."""
     pose = {"position": [1, 2, 3], "quaternion": [1, 0, 0, 0.5], "scale": 2}
     matrix = [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 1], [0, 0, 0, 1]]
     size = {"width": 64, "height": 48}

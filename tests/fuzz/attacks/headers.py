@@ -151,8 +151,8 @@ class Attack:
         return "requests", do
 
     def _answer(self, path, headers):
-        """All that the server says before it closes the connection, or begins to speak
-        of the scene."""
+        """Return everything that the server sends before it closes the connection or
+        begins to describe the scene."""
         lines = [b"GET " + path + b" HTTP/1.1", *(name + b": " + value for name, value in headers)]
         with socket.create_connection(
             ("127.0.0.1", self._site.port), timeout=_SECONDS
@@ -168,8 +168,8 @@ class Attack:
 
 
 def _request(rng, port):
-    """A path and headers: of a browser, with some of them exchanged, damaged, left out
-    or there twice."""
+    """Return a path and headers as a browser sends them, with some exchanged, damaged,
+    missing or repeated."""
     host = rng.choice(_HOSTS if rng.random() < 0.7 else _OTHER_HOSTS).format(port=port)
     headers = [("Host", host)]
     if rng.random() < 0.5:
@@ -198,8 +198,8 @@ def _request(rng, port):
 
 
 def _damaged(rng, value):
-    """The text with a few bytes more, fewer or others; no line ends, which would begin
-    another header."""
+    """Return the text with a few bytes added, removed or changed, but no line ends,
+    which would begin another header."""
     damaged = bytearray(value)
     for _ in range(rng.choice((1, 1, 2, 5))):
         place = rng.randrange(len(damaged) + 1)
@@ -211,7 +211,7 @@ def _damaged(rng, value):
 
 
 def _fault_of(answer, path, headers):
-    """What is wrong with an answer, or None."""
+    """Return what is wrong with an answer, or None."""
     if not answer:
         return None
     head = answer.partition(b"\r\n\r\n")[0].lower()

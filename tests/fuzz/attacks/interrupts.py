@@ -34,11 +34,11 @@ from random_bundle import random_gaussians
 
 LIMIT_S = 100
 PACKAGE = os.path.dirname(v3dg.__file__) + os.sep
-# What runs before Ctrl-C is heard is Python's start and the import of one small module
-# of ours.
-NOTE = re.compile(r"\S+\.\w+: ")  # what a command says of a file
+# Before Ctrl-C has an effect, only the start of Python and the import of one small
+# module of ours run.
+NOTE = re.compile(r"\S+\.\w+: ")  # a command reports this about a file
 OURS = re.compile(re.escape(PACKAGE) + r"(?!__init__\.py\", line 3, |_start\.py)")
-SOON_S = 15  # on a machine with much else to do
+SOON_S = 15  # on a busy machine
 
 SMALL = ["--size", "40", "30", "--quiet"]
 COMMANDS = {
@@ -103,7 +103,7 @@ class Attack:
         if name not in self._whole and not name.startswith("view"):
             self._whole[name] = self._of_nothing(name, work)
         seconds = 2.0 if name.startswith("view") else self._whole[name][0]
-        # Many at the start, while modules are imported.
+        # Many moments are at the start, while modules are imported.
         moment = rng.uniform(0, rng.choice((0.5, seconds)))
         gap = rng.choice((0, rng.uniform(0, 0.05), rng.uniform(0, 0.5)))
         before = names_in(copied(self._shared, work))
@@ -127,8 +127,8 @@ class Attack:
         return name, do
 
     def _of_nothing(self, name, work):
-        """The seconds of a command that nothing interrupts, and the files that it
-        writes."""
+        """Return the seconds of a command that nothing interrupts, and the files that
+        it writes."""
         place = work.parent / f"{work.name}_whole"
         place.mkdir()
         before = names_in(copied(self._shared, place))
@@ -145,7 +145,7 @@ class Attack:
                 continue
             if path not in made:
                 return f"left {path}"
-            if name == "demo":  # it shows how long things took
+            if name == "demo":  # shows how long things took
                 with Image.open(work / path) as picture:
                     picture.load()
             elif (work / path).read_bytes() != made[path]:
@@ -157,8 +157,8 @@ class Attack:
 
 
 def _wait_for(process, out, moment, name, connections):
-    """Until the moment comes; of the viewer, often after it has begun to listen, with
-    others connected."""
+    """Wait for the moment; for the viewer, this is often after it has begun to listen,
+    with other connections."""
     end = time.monotonic() + moment
     if name == "view, connected":
         port, patience = None, time.monotonic() + 20
@@ -187,14 +187,14 @@ def _fault(ended: Ended, name):
     if ended.was_long:
         return "did not end by itself" + (f", and left behind: {ended.left}" if ended.left else "")
     if ended.code == -signal.SIGINT and not ended.err:
-        return f"left behind: {ended.left}" if ended.left else None  # before Python listened to it
+        return f"left behind: {ended.left}" if ended.left else None  # before Python handled it
     if "KeyboardInterrupt" in ended.err and ERROR not in ended.err and not OURS.search(ended.err):
-        # Before any of our code was there.
+        # None of our code ran before this.
         return f"left behind: {ended.left}" if ended.left else None
     is_view = name.startswith("view")
     fault = fault_of(ended, codes=(0, 130), is_heard=not is_view)
     lines = [line for line in shown_lines(ended.err) if not PROGRESS.match(line)]
-    if ended.code == 0:  # a command that came to its end says what it noticed of its files
+    if ended.code == 0:  # a command that ends reports what it noticed about its files
         lines = [line for line in lines if not NOTE.match(line)]
     if fault is None and len(lines) > (ended.code != 0):
         fault = f"{len(lines)} lines: {ended.err[-200:]!a}"

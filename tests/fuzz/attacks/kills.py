@@ -70,12 +70,12 @@ class Attack:
         seconds, _ = self._of_nothing(what, "asset.ply", work)
         self._of_nothing(what, "other.ply", work)
         before = self._put(work, "asset.ply")
-        is_replaced = rng.random() < 0.5  # something is there already
+        is_replaced = rng.random() < 0.5  # a file exists already
         if is_replaced:
             (work / name).write_bytes(b"before")
         moments = [rng.uniform(0, 1.05 * seconds) for _ in range(rng.choice((1, 1, 2, 4)))]
-        # Another asset takes the place of the one that is built, perhaps with its date
-        # or an older one.
+        # Another asset replaces the one that is built, perhaps with its date or an
+        # older date.
         swaps = what.startswith("build") and rng.random() < 0.4
         date = rng.choice((None, 0, os.stat(work / "asset.ply").st_mtime_ns))
 
@@ -101,7 +101,7 @@ class Attack:
                 swaps
                 and ended.code == 1
                 and f"{name}.partial: expected levels of this build" in ended.err
-            ):  # as it should
+            ):  # as expected
                 (work / f"{name}.partial").unlink()
                 ended = run([], work, program=program, limit_s=60)
             fault = fault_of(ended, codes=(0,))
@@ -124,7 +124,7 @@ class Attack:
         return names_in(work)
 
     def _of_nothing(self, what, asset, work):
-        """The seconds and the bytes of one that nothing stops."""
+        """Return the seconds and the bytes of a run that nothing stops."""
         key = what, asset if what.startswith("build") else ""
         if key not in self._whole:
             program, name = self.kinds[what]
@@ -137,7 +137,7 @@ class Attack:
 
 
 def _left(work, name):
-    """What an unfinished build left."""
+    """Return what an unfinished build left."""
     return " and ".join(end for end in ("partial", "scratch") if (work / f"{name}.{end}").exists())
 
 
@@ -149,10 +149,10 @@ def _kill(moment, process, _):
 
 
 def _fault_of_files(work, before, name, whole, is_replaced):
-    """Whether the file is as it was or whole, and beside it is only what is known to be
-    no file yet."""
+    """Return whether the file is unchanged or whole, and beside it are only files that
+    are known to be unfinished."""
     for path in names_in(work) - before - {name, f"{name}.partial"}:
-        if path.startswith(f"{name}.scratch"):  # gone after the next that ends
+        if path.startswith(f"{name}.scratch"):  # removed by the next one that ends
             continue
         if not (path.startswith(f".{name}") and path.endswith(".tmp")):
             return f"left {path}"

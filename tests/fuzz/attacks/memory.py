@@ -1,5 +1,5 @@
-"""Commands with a limit on memory at a random height, set once their modules are there:
-done, or one line."""
+"""Commands with a random limit on memory, which is set after their modules are loaded:
+they succeed, or print one line."""
 
 import resource
 import sys
@@ -9,11 +9,12 @@ from fuzz.attacks.pool import Outcome
 from fuzz.attacks.program import copied, fault_of, make_files, outcome, run
 
 LIMIT_S = 120
-# Modules are loaded, OpenMP's threads are started and the stack has grown before the
-# limit is set: what fails there ends a process without a word. So does NumPy where it
-# finds no memory for the buffers of an operation, 64 kB each (PyErr_NoMemory of
-# npyiter_allocate_buffers, without the GIL, 2.4): they are made small. Pillow would not
-# say why it knows no format whose module could not be loaded.
+# Before the limit is set, modules are loaded, the threads of OpenMP are started, and
+# the stack has grown, because failures of these end a process without a message. So
+# does NumPy if there is no memory for the buffers of an operation, 64 kB each
+# (PyErr_NoMemory of npyiter_allocate_buffers, without the GIL, 2.4), so they are made
+# small. Pillow would not report why it does not know a format whose module could not be
+# loaded.
 PROGRAM = """
 import contextlib, importlib, json, pkgutil, resource, sys
 import numpy, PIL.Image, zstandard
@@ -61,7 +62,7 @@ class Attack:
             ended = run(
                 COMMANDS[name], work, program=program, limit_s=90, most=resource.RLIM_INFINITY
             )
-            # The C library, which no program can ask to go on.
+            # This is the C library, after whose failure no program can continue.
             if "memory for thread-local data" in ended.err:
                 return Outcome("ended by the C library")
             fault = fault_of(ended, codes=(0, 1))

@@ -1,26 +1,27 @@
-"""How much memory a piece of work held, and a limit so that no try takes the
-machine's."""
+"""The peak memory of a piece of work, and a limit so that no try takes all memory of
+the machine."""
 
 import ctypes
 import resource
 
 
 class Watch:
-    """From when it is made."""
+    """Measures from its creation on."""
 
     def __init__(self):
-        ctypes.CDLL(None).malloc_trim(0)  # what was freed would hide what is taken next
+        ctypes.CDLL(None).malloc_trim(0)  # freed memory would hide what is allocated next
         with open("/proc/self/clear_refs", "w") as file:
             file.write("5")
         self._before = _status("VmRSS")
 
     def megabytes(self):
-        """The most that was held at once, beyond what was held at first."""
+        """Return the peak memory in MB beyond the memory at the start."""
         return (_status("VmHWM") - self._before) / 1e6
 
 
 def limit_growth(num_bytes):
-    """Let this process take so much more than it has, so that more is a MemoryError."""
+    """Let this process allocate at most this much more memory; more is a
+    MemoryError."""
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + num_bytes, hard))
 

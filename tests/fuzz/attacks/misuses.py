@@ -30,8 +30,8 @@ ERRORS = {
     "OSError",
 }
 ERRORS |= {"FileNotFoundError", "IsADirectoryError", "NotADirectoryError", "PermissionError"}
-# What Python and NumPy say where a value of another kind is used: no more is promised
-# for those.
+# Messages of Python and NumPy for values of another kind. No better messages are
+# promised for those.
 PYTHONS = {"AttributeError", "UnicodeEncodeError", "UFuncTypeError"}
 NOT_OURS = re.compile(
     "Unable to cast|incompatible function|incompatible constructor|std::|vector::|C\\+\\+"
@@ -158,8 +158,8 @@ class Attack:
         return name, do
 
     def _writing(self, rng):
-        """An array that is handed out is read-only, or can be written to without
-        harm."""
+        """An array that is handed out is read-only, or writing to it has no effect on
+        us."""
         bundle = v3dg.Bundle.open(self._shared / "a.v3dg")
         camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
         scene = v3dg.Scene.of(bundle)
@@ -202,8 +202,8 @@ class Attack:
 
 
 def _calls(shared, work):
-    """Each public function with arguments that are right: what is changed are some of
-    them."""
+    """Yield each public function with valid arguments, of which some are then
+    changed."""
     rng = np.random.default_rng(0)
     asset, bundle = random_gaussians(rng, 30, 1), random_bundle(1, num_levels=3, sh_degree=1)
     scene = v3dg.Scene()
@@ -236,7 +236,7 @@ def _calls(shared, work):
 
     def built(**values):
         config = v3dg.BuildConfig(**values)
-        if config.steps < 10:  # more is much work, and no mistake
+        if config.steps < 10:  # more is much work, and not a mistake
             v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
 
     def rendered_from(**values):
@@ -273,6 +273,11 @@ def _calls(shared, work):
         v3dg.scan(scene, v3dg.Lidar(**values), np.eye(4), tolerance=50.0)
 
     lidar = v3dg.Lidar(np.linspace(0, 6, 9), np.linspace(-1, 1, 4))
+
+    def drawn_among(**values):
+        channels = ("depth", "normal", "label", "weight")
+        mesh = v3dg.MeshLayer(**values)
+        v3dg.render(scene, camera, mesh=mesh, channels=channels, device="cpu")
 
     def tables(**values):
         kind = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
@@ -383,6 +388,8 @@ def _calls(shared, work):
                 "fade": 1.05,
                 "background": (0.0, 0.5, 1.0),
                 "depth": True,
+                "channels": ("median_depth", "clipped"),
+                "mesh": v3dg.MeshLayer(np.zeros((2, 6, 8, 3)), np.ones((2, 6, 8))),
                 "out": v3dg.BatchPlanes(
                     np.zeros((2, 6, 8, 4), np.float32), None, np.zeros((2, 6, 8), np.float32)
                 ),
@@ -391,6 +398,19 @@ def _calls(shared, work):
         "Scene.set_environment": (
             changed("set_environment"),
             {"environment": np.array([0, 3]), "ids": [0, 2]},
+        ),
+        "Scene.set_label": (changed("set_label"), {"label": np.array([0, 3]), "ids": [0, 2]}),
+        "MeshLayer": (
+            drawn_among,
+            {
+                "color": np.full((6, 8, 3), 0.5),
+                "depth": np.full((6, 8), 8.0),
+                "coverage": np.full((6, 8), 0.5),
+                "normal": np.full((6, 8, 3), 0.5),
+                "instance": np.full((6, 8), 7),
+                "label": np.full((6, 8), 3),
+                "light": "linear",
+            },
         ),
         "Clusters": (v3dg.Clusters, clusters),
         "Groups": (v3dg.Groups, groups),
@@ -415,7 +435,13 @@ def _calls(shared, work):
         ),
         "render an asset": (
             v3dg.render,
-            {"subject": asset, "camera": camera, "background": (0.0, 0.0, 0.0), "device": "cpu"},
+            {
+                "subject": asset,
+                "camera": camera,
+                "background": (0.0, 0.0, 0.0),
+                "channels": ("instance", "clipped"),
+                "device": "cpu",
+            },
         ),
         "render a cut": (
             v3dg.render,
@@ -497,7 +523,7 @@ def _wrong(rng, value):
 
 
 def _changed(rng, value):
-    """Nearly what is right."""
+    """Return a value that is nearly valid."""
     if isinstance(value, os.PathLike):
         name = os.fspath(value)
         return rng.choice(
@@ -604,7 +630,7 @@ def _text(value):
 
 
 def _outcome_of_call(function, arguments, wrong, told):
-    """What comes of a call; `told` says what it was given."""
+    """Return the outcome of a call; `told` describes its arguments."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
@@ -612,7 +638,7 @@ def _outcome_of_call(function, arguments, wrong, told):
         except Exception as error:
             name, text = type(error).__name__, str(error)
             fault = f"{name}: {text[:150]!a}, {told}"[:500]
-            # What was given may have lines of its own, as arrays have in a message.
+            # Arguments may have several lines in a message, as arrays have.
             is_one_line = "\n" not in text.replace("a\nb", "") or ": expected " in text
             is_ours = name in ERRORS and not NOT_OURS.search(text) and is_one_line
             if not is_ours and name not in PYTHONS:
@@ -627,8 +653,8 @@ def _outcome_of_call(function, arguments, wrong, told):
 
 
 def _names(text, wrong):
-    """Whether a text says which argument it is about: by its name, or as our messages
-    begin."""
+    """Return whether a text says which argument it is about: by its name, or in the
+    form of our messages."""
     return bool(re.match(r"[\w.\[\], ()'/-]+: ", text)) or any(
         re.sub(r".*\.", "", name) in text for name in wrong
     )

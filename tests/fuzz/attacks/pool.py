@@ -28,21 +28,22 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 TESTS = HERE.parents[1]
 KEPT_OF_ONE_SORT = 3
-QUOTE = ": '"  # what follows tells one fault of a sort from another
+QUOTE = ": '"  # the rest distinguishes faults of the same kind
 
 
 @dataclasses.dataclass
 class Outcome:
-    """What came of a try."""
+    """The outcome of a try."""
 
     name: str
-    fault: str | None = None  # one line; None where all was right
-    is_low: bool = False  # no more than a message that could say more
-    megabytes: float = 0.0  # at most held; measured by the child where it does the work itself
+    fault: str | None = None  # one line; None if everything was right
+    is_low: bool = False  # only a message that could say more
+    megabytes: float = 0.0  # peak memory; the child measures it if it does the work itself
 
 
 def environment():
-    """Of a child: v3dg, the tests and no more threads than children."""
+    """Return the environment of a child: v3dg, the tests, and no more threads than
+    children."""
     given = [
         os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path
     ]
@@ -55,13 +56,13 @@ def environment():
 
 
 def has_module():
-    """Whether the compiled module lies beside the sources; else the installed package
-    is attacked."""
+    """Return whether the compiled module is beside the sources; otherwise the installed
+    package is attacked."""
     return any((TESTS.parent / "v3dg").glob("_core.*.so"))
 
 
 class Child:
-    """A process that does tries, and is started anew when one ends it."""
+    """A process that does tries. If a try ends it, it is started again."""
 
     def __init__(self, kind, seed, shared, work, limit_s):
         self._command = [
@@ -76,7 +77,8 @@ class Child:
         self._process = None
 
     def do(self, number):
-        """The child's record of a try, or ours of how it ended the child."""
+        """Return the child's record of a try, or a record of how the try ended the
+        child."""
         if self._process is None:
             self._start()
         self._process.stdin.write(f"{number}\n".encode())
@@ -125,9 +127,9 @@ class Child:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=environment(),
-                cwd=self._log.parent,  # for what is written by a name alone
+                cwd=self._log.parent,  # for files that are written under a plain name
                 start_new_session=True,
-                bufsize=0,  # `select` sees nothing of what lies in a buffer
+                bufsize=0,  # `select` does not see data in a buffer
             )
 
     def _line(self, end):
@@ -154,15 +156,15 @@ class Child:
 
 
 def _quick_folder():
-    """In memory, where there is enough: each try writes files, and waits for a disk
-    where there is one."""
+    """Return a folder in memory if there is enough, because each try writes files, and
+    a disk would delay it."""
     shared = "/dev/shm"
     return shared if os.path.isdir(shared) and shutil.disk_usage(shared).free > 2 << 30 else None
 
 
 def _stack_of(log):
-    """Of the thread that did it; where none is said to have, of the main one, which is
-    the last."""
+    """Return the stack of the thread that did it; if this is unknown, of the main
+    thread, which is the last."""
     log = (
         log.rsplit("Current thread ", 1)[-1]
         if "Current thread " in log
@@ -172,8 +174,8 @@ def _stack_of(log):
 
 
 def attack(kind, numbers, *, seconds, seed=0, kept=None, children=None):
-    """Try what has these numbers until the time is up, and summarise it as JSON
-    values."""
+    """Run the tries with these numbers until the time is over, and summarise them as
+    JSON values."""
     start = time.monotonic()
     children = children or max(2, len(os.sched_getaffinity(0)))
     with tempfile.TemporaryDirectory(prefix="v3dg-attack-", dir=_quick_folder()) as folder:

@@ -1,5 +1,5 @@
-"""The command line as users start it: what it is given, how it ends, what it leaves,
-what is wrong there."""
+"""The command line as users start it: its inputs, how it ends, what it leaves behind,
+and what is wrong."""
 
 import contextlib
 import dataclasses
@@ -21,15 +21,16 @@ from fuzz.attacks.pool import Outcome
 from random_bundle import random_gaussians
 
 COMMAND = [sys.executable, "-m", "v3dg"]
-MOST_BYTES = 8 << 30  # of addresses: more is the machine's end, not the program's
-# What is no error: OpenMP's runtime on what it was told, assets that a command goes
-# through, bars, and that there was no memory for the thread that watches these.
+MOST_BYTES = 8 << 30  # address space; more would endanger the machine, not the program
+# Lines that are no errors: of OpenMP's runtime about its settings, names of assets that
+# a command reads, progress bars, and that there was no memory for the thread that
+# watches the progress.
 PROGRESS = re.compile(r"libgomp: |v3dg: warning: tqdm:|\[\d+/\d+\] |failed: |.*: \d+ %$|$")
 ERROR = "v3dg: error: "
 
 
 def make_files(folder):
-    """Small subjects of each kind, by names that commands are given."""
+    """Create small subjects of each kind, with names that commands use."""
     rng = np.random.default_rng(0)
     asset = random_gaussians(rng, 300, 1)
     for name in ("a.ply", "a.spz", "a.sog", "a.compressed.ply"):
@@ -61,7 +62,7 @@ def make_files(folder):
 class Ended:
     """How a program ended."""
 
-    code: int | None  # None: it did not, and was killed
+    code: int | None  # None: it did not end, and was killed
     out: str
     err: str
     seconds: float
@@ -82,7 +83,7 @@ def run(
     out=None,
     most=MOST_BYTES,
 ):
-    """Start a program in a session of its own, let `meddle` do something to it, and see
+    """Start a program in its own session, let `meddle` do something to it, and return
     how it ends.
 
     What takes longer than the limit is interrupted as by Ctrl-C, and killed when that
@@ -92,7 +93,7 @@ def run(
     files = [log.open("wb") for log in logs]
 
     def before():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs ignore it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # background jobs of a shell ignore it
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         for descriptor in closed:
             os.close(descriptor)
@@ -141,13 +142,14 @@ def _wait(process, end):
 
 
 def is_running(process):
-    """Without taking its exit code, which the one who waits for it gets."""
+    """Return whether it runs, without reaping it, because another place waits for its
+    exit code."""
     return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
 
 def _in_session(leader, patience_s=2):
-    """Processes of a session whose first one has ended, when they had a moment to end,
-    too."""
+    """Return the processes of a session whose first process has ended, after a moment
+    in which they could end, too."""
     end = time.monotonic() + patience_s
     while True:
         found = {}
@@ -163,13 +165,13 @@ def _in_session(leader, patience_s=2):
 
 
 def shown_lines(text):
-    """What a terminal shows in the end of lines that were written over."""
+    """Return the lines that a terminal shows at last, if lines were overwritten."""
     lines = [line.rstrip().rsplit("\r", 1)[-1] for line in text.split("\n")]
     return [line for line in lines if line.strip()]
 
 
 def fault_of(ended, *, codes=(0, 1, 2), is_heard=True):
-    """What is wrong with how a command ended."""
+    """Return what is wrong with the way in which a command ended."""
     if ended.code is None:
         return f"no end, and Ctrl-C did not help: {ended.err[-200:]!a}"
     if ended.code < 0:
@@ -207,13 +209,13 @@ def names_in(folder):
 
 
 def copied(shared, work):
-    """The subjects, as this try's own."""
+    """Return copies of the subjects for this try."""
     shutil.copytree(shared / "files", work, dirs_exist_ok=True, symlinks=True)
     return work
 
 
 def documents(text):
-    """The JSON document of a result, or None."""
+    """Return the JSON document of a result, or None."""
     try:
         return json.loads(text)
     except ValueError:

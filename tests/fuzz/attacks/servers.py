@@ -30,13 +30,13 @@ from v3dg.bundle.codec import Codec
 
 LIMIT_S = 100
 SOON_S = 60
-PATIENCE_S = 3  # in place of the program's own, so that a round takes minutes
-MOST_UNKNOWN_BYTES = 16 << 20  # as well
-MOST_SENT = 12 << 20  # beyond the file: what lies in buffers of sockets, of several requests
+PATIENCE_S = 3  # shorter than in the program, so that a round takes minutes
+MOST_UNKNOWN_BYTES = 16 << 20  # likewise
+MOST_SENT = 12 << 20  # beyond the file: data in buffers of sockets, of several requests
 MOST_MEGABYTES = 500
 MOST_ADDRESSES = 6 << 30
-# What goes on between the bytes of a file ends with the patience alone; nothing of it
-# is held.
+# If data arrives without end instead of the rest of a file, only the patience ends it;
+# the data is not kept.
 OUTSIDE_OF_BODIES = ("100 without end", "chunk's extension without end", "trailers without end")
 SECRETS = ("hunter2", "s1gnature", "Zm9v")
 TB = 1 << 40
@@ -52,7 +52,7 @@ sys.exit(main())
 
 
 class Connection:
-    """One connection of a client, and the requests that come on it."""
+    """One connection of a client, and its requests."""
 
     def __init__(self, server, stream):
         self.server = server
@@ -60,7 +60,7 @@ class Connection:
         self._buffer = b""
 
     def request(self):
-        """Method, path and headers of the next one; None at the end."""
+        """Return the method, path and headers of the next request; None at the end."""
         while b"\r\n\r\n" not in self._buffer:
             data = self.stream.recv(65536)
             if not data:
@@ -94,7 +94,7 @@ class Connection:
             self.send(body)
 
     def good(self, **headers):
-        """What an honest server answers."""
+        """Answer like a correct server."""
         body = self.server.body
         if self.part and self.part[0] < len(body):
             first, last = self.part[0], min(self.part[1], len(body))
@@ -180,7 +180,7 @@ def claims(length):
 
 
 def claims_honest_parts(length):
-    """A file of another size, whose parts are nevertheless sent."""
+    """The server claims another size of the file, but sends the requested parts."""
 
     def behaviour(c):
         if not c.part:
@@ -276,7 +276,7 @@ def chunked(*chunks, end=b"0\r\n\r\n", endless=None):
 
 
 def of_unknown_size(body=None, endless=False):
-    """No HEAD, no parts, no size."""
+    """The server knows no HEAD request, no ranges and no size."""
 
     def behaviour(c):
         if c.method == "HEAD":
@@ -314,7 +314,7 @@ def waits(c):
 
 
 def changing(c):
-    """Other bytes of the same size with every request."""
+    """Every request gets other bytes of the same size."""
     turned = bytes(255 - value for value in c.server.body[4096:])
     body, c.server.body = c.server.body, c.server.body[:4096] + turned
     c.good()
@@ -333,7 +333,7 @@ def parts_then_none(c):
 
 
 def forged(num_clusters, pages_bytes):
-    """The head of a bundle with tables of any size."""
+    """The server sends the header of a bundle with tables of any size."""
     entries = file_format.entries_of(Codec(0), num_clusters, 1, 1, pages_bytes)
     header = file_format.header_of(entries, Codec(0), {})
     size = len(header) + entries["hash"]["data_offsets"][1]
@@ -365,8 +365,8 @@ def tagged(c):
 ENDLESS_HEADER = b"HTTP/1.1 200 OK\r\n"
 RIGHT, WRONG, EITHER = "right", "wrong", "either"
 
-# What a server does: the kind of file that is asked for, how that has to end, and the
-# function that does it.
+# The behaviours of a server: the kind of file that is requested, the expected end, and
+# the function.
 BEHAVIOURS = {
     "honest": ("v3dg", RIGHT, lambda c: c.good()),
     "honest asset": ("ply", RIGHT, lambda c: c.good()),

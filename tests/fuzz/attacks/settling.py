@@ -93,14 +93,15 @@ class Expected:
 
 
 class Trial:
-    """A scene, the pool that is tried with it, and views of it."""
+    """A scene, the pool that is tested with it, and views of it."""
 
     def __init__(self, scene, name, rng, expected):
         self.scene = scene
         self.name = name
         self.rng = rng
         self.cut = CUTS[int(rng.integers(len(CUTS)))]
-        # A view of the finer cuts takes about 400 kB of rows, or 120 kB of codes.
+        # A view with one of the finer cuts takes about 400 kB of rows, or 120 kB of
+        # codes.
         full = 400_000 if name == "float32" else 120_000
         self.memory = int(full * rng.choice([0.5, 0.75, 1.0, 2.0, 4.0, 100.0]))
         self._expected = expected
@@ -112,7 +113,7 @@ class Trial:
         )
 
     def fault_of(self, number, image):
-        """What is wrong with the picture of a settled view, or None."""
+        """Return what is wrong with the picture of a settled view, or None."""
         stats = image.stats
         if stats.missing:
             return f"a settled picture misses {stats.missing} pages"
@@ -135,7 +136,8 @@ def digest(image):
 
 @contextlib.contextmanager
 def busy_threads(count):
-    """Other threads that keep the machine busy, in turns of unlike lengths."""
+    """Run other threads that keep the machine busy, for intervals of different
+    lengths."""
     ends = threading.Event()
 
     def work():
@@ -158,8 +160,8 @@ def busy_threads(count):
 
 
 def after_settling(trial):
-    """Right after each `settle`, in a flight with pictures that wait for nothing in
-    between."""
+    """Draw right after each `settle`, in a flight with pictures in between that do not
+    wait."""
     renderer = v3dg.Renderer(trial.scene, device=DEVICE, memory=trial.memory)
     for _ in range(NUM_SETTLED):
         for number in trial.rng.integers(0, NUM_CAMERAS, int(trial.rng.integers(0, 3))):
@@ -174,7 +176,7 @@ def after_settling(trial):
 
 
 def stills_of_threads(trial):
-    """`v3dg.render` with the same `memory` from two to eight threads."""
+    """Call `v3dg.render` with the same `memory` from two to eight threads."""
     faults = []
 
     def draw(numbers):
@@ -196,8 +198,8 @@ def stills_of_threads(trial):
 
 
 def forks(trial):
-    """Children of a process whose threads draw: what they may share is right, and the
-    rest a clear error."""
+    """Fork a process whose threads draw. Its children draw what they may share
+    correctly, and get a clear error for the rest."""
     faults = []
     ends = threading.Event()
     renderer = v3dg.Renderer(trial.scene, device=DEVICE, memory=trial.memory)
@@ -230,7 +232,7 @@ def forks(trial):
 
 
 def in_child(trial, renderer, number):
-    """What a child of a fork finds, or None."""
+    """Return what a child of a fork finds, or None."""
     camera = trial.camera(number)
     image = v3dg.render(trial.scene, camera, device=DEVICE, memory=trial.memory, **trial.cut)
     if fault := trial.fault_of(number, image):
@@ -250,7 +252,7 @@ def in_child(trial, renderer, number):
 
 
 def fault_of_child(work):
-    """What work() returns in a child of a fork; a child that does not end is a
+    """Return what work() returns in a child of a fork; a child that does not end is a
     fault."""
     with tempfile.TemporaryFile() as report:
         pid = os.fork()

@@ -65,7 +65,7 @@ def _of_states(look, states):
 
 
 def _scene(bundles, poses):
-    """Half of the instances of each bundle."""
+    """Return half of the instances of each bundle."""
     scene, count = v3dg.Scene(), len(poses["positions"])
     for b, bundle in enumerate(bundles):
         rows = slice(b * count // 2, (b + 1) * count // 2)
@@ -74,7 +74,8 @@ def _scene(bundles, poses):
 
 
 def _together(change, looks, num_changes):
-    """The first fault of threads that look, while the main one changes."""
+    """Return the first fault of the threads that look, while the main thread changes
+    the scene."""
     ends, faults = threading.Event(), []
 
     def go_on(look, right):
@@ -99,7 +100,7 @@ def _together(change, looks, num_changes):
 
 
 def _looks(scene, states):
-    """Threads that draw, select and use a copy."""
+    """Run threads that draw, select and use a copy."""
     pictures, cuts = _of_states(_drawn, states), _of_states(_selected, states)
     return [
         *[(lambda: _drawn(scene), pictures)] * NUM_DRAWERS,
@@ -119,7 +120,8 @@ def moved_some(rng, bundles):
     scene, states = _scene(bundles, first), [_scene(bundles, first) for _ in range(2)]
     states[1].move(ids, **second)
     ways = [{name: values[ids] for name, values in first.items()}, second]
-    # Quaternions are made unit: what is moved there is again what it was.
+    # Quaternions are normalised, so an instance that is moved back has the same pose
+    # again.
     scene.move(ids, **ways[0])
     states[0].move(ids, **ways[0])
     return _together(lambda i: scene.move(ids, **ways[(i + 1) % 2]), _looks(scene, states), 150)
@@ -150,7 +152,7 @@ def added_and_removed(rng, bundles):
 
 
 def added_by_many(rng, bundles):
-    """Nothing is lost, and what is there can be drawn."""
+    """No instance is lost, and each can be drawn."""
     scene, poses = v3dg.Scene(), [_poses(rng, 3) for _ in range(40)]
     start, faults, ids = threading.Barrier(4), [], []
 
@@ -179,7 +181,7 @@ def added_by_many(rng, bundles):
 
 
 def moved_by_many(rng, bundles):
-    """Each moves its own; in the end all are where they were put."""
+    """Each thread moves its own instances; at the end all are where they were put."""
     poses, last = _poses(rng, 20), _poses(rng, 20)
     scene, expected = _scene(bundles, poses), _scene(bundles, last)
 
@@ -213,8 +215,8 @@ def copied_while_it_changes(rng, bundles):
 
 
 def copies_are_apart(rng, bundles):
-    """A change of a copy does not change the scene; a selection goes through a pickle
-    with its scene."""
+    """A change of a copy does not change the scene; a selection can be pickled with its
+    scene."""
     poses = _poses(rng, 20)
     scene = _scene(bundles, poses)
     before, cut = _drawn(scene), _selected(scene)
@@ -236,7 +238,7 @@ def copies_are_apart(rng, bundles):
 
 
 def cut_outlives_its_instances(rng, bundles):
-    """A cut of what is no longer there is refused, or draws what it chose."""
+    """A cut of removed instances is refused, or draws what it selected."""
     scene = _scene(bundles, _poses(rng, 20))
     cut = v3dg.select(scene, CAMERA, tolerance=1.0, device="cpu")
     changes = [

@@ -16,7 +16,7 @@ from benchmarks.worlds.procedural import make_person
 from v3dg._judges import Judges
 from v3dg.metrics import has_flip
 
-pytestmark = pytest.mark.slow  # every test builds and compares levels
+pytestmark = pytest.mark.slow  # each test builds levels and compares them
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,8 @@ def test_level_is_at_home_at_two_px2_of_the_ball_a_gaussian(folder):
     thing = subject(folder, "thing")
     for factor in (1, 4):
         for size in thing.sizes(300, factor, widest=1 << 20):
-            # The ball touches the sides of the picture: its footprint is the disc in
-            # it, seen from near by.
+            # The ball touches the borders of the picture, so its footprint is the
+            # inscribed disc, enlarged by the nearness.
             half = size.camera.width / 2
             angle = math.atan(half / size.camera.fx)
             footprint = 2 * math.pi * (1 - math.cos(angle)) * size.camera.fx**2
@@ -143,7 +143,8 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
     pairs.measure(config)
     result = json.loads((tmp_path / "all" / "pairs.json").read_text())
     rows = {(r["asset"], r["method"], r["level"], r["factor"]): r for r in result["rows"]}
-    # An object's two counts and a scene's one level of others, two sizes each.
+    # The object has two other counts and the scene has one, with two picture sizes
+    # each.
     assert len(rows) == 2 * (2 * 4 + 4)
     for (asset, method, level, factor), row in rows.items():
         assert 0 < row["flip"] < 1
@@ -157,7 +158,7 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
     for row in best:
         others = rows[row["asset"], row["best"], row["level"], row["factor"]]
         assert row["ratio"] == row["ours_flip"] / others["flip"]
-    # Of the scene's level those count that are in the picture.
+    # For the scene, only the level's gaussians inside the picture count.
     place = subject(folder, "place")
     for _, _, level in place.peers((12.5,)):
         in_picture = place.counts(level)[0]
@@ -166,8 +167,8 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
             assert rows["place", "d", "12.5 %, d", factor]["gaussians"] == in_picture
             assert rows["place", "ours", "12.5 %, d", factor]["gaussians"] <= in_picture
     best = [row for row in best if row["asset"] == "thing"]
-    # A second run measures one method again and a new one, and takes the others from
-    # the first.
+    # The second run measures one method again and one new method; the other results are
+    # those of the first run.
     known = (tmp_path / "all" / "pairs.json",)
     methods = ("refined", "merged")
     again = pairs.Measure(

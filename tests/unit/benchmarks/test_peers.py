@@ -1,4 +1,4 @@
-"""The comparison with other rasterizers, with stand-ins for them, on the CPU."""
+"""The comparison with other rasterizers on the CPU, with replacements for them."""
 
 import json
 from dataclasses import fields
@@ -16,7 +16,7 @@ from reference import project
 
 torch = pytest.importorskip("torch")
 
-# Draws as gsplat is asked to, with our own rasterizer.
+# Draws with our own rasterizer under the options of gsplat.
 GSPLAT = """
 import torch, v3dg
 
@@ -70,8 +70,8 @@ LAYOUT = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An object and two of them, and peers: one that draws right, one that does not,
-    one that crashes."""
+    """One object and two copies of it, and three peers: one draws correctly, one draws
+    wrongly, and one crashes."""
     folder = tmp_path_factory.mktemp("peers")
     files = {
         "layout.json": json.dumps(LAYOUT),
@@ -94,7 +94,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(folder):
-    """What one run over small scenes says."""
+    """Return the results of one run over small scenes."""
     peers.main(
         peers.Config(
             asset=folder / "thing.ply",
@@ -240,4 +240,4 @@ def test_captured_assets_are_seen_from_above(folder):
         px = view[:, :2] / view[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         inside = ((px > 0) & (px < [camera.width, camera.height])).all(1) & (view[:, 2] > 0)
         assert inside.mean() > 0.85
-        assert (camera.viewmat[2, 2] < -0.9) == steep  # looks down the world's z
+        assert (camera.viewmat[2, 2] < -0.9) == steep  # looks down along z of the world

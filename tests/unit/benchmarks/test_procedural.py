@@ -103,8 +103,8 @@ def test_donut_has_a_hole_and_lies_around_the_origin():
 
 
 def test_icing_shines():
-    """Towards the mirrored sun the icing is brighter than from below it: at degree 3 by
-    much."""
+    """The icing is brighter towards the mirrored sun than from below, and much brighter
+    at SH degree 3."""
     donut = make_donut(8000)
     top = (donut.means[:, 2] > 0.03) & (donut.opacities > 0.5)
     assert np.percentile(np.abs(donut.sh[top, 9:]).max(axis=(1, 2)), 90) > 0.05
@@ -145,7 +145,7 @@ def test_person_has_human_measures(seed):
 
 @pytest.mark.parametrize("make", [make_donut, make_temple, make_person])
 def test_surfaces_are_spread_like_trained_ones(make):
-    """Within factors of what was measured on a trained asset: docs/worlds.md has
+    """The values agree with those of a trained asset within factors; docs/worlds.md has
     both."""
     asset = make(60_000)
     thin, middle, long = np.sort(asset.scales, axis=1).T
@@ -161,8 +161,8 @@ def test_leaves_are_thin_and_let_light_through():
     thin, _, long = np.sort(tree.scales, axis=1).T
     assert np.median(long / thin) > 8
     assert (tree.opacities < 0.75).mean() > 0.2
-    # Against the sun a leaf is brighter than along it: the linear terms of green follow
-    # the sun's direction.
+    # A leaf is brighter against the sun than along it, because the linear terms of
+    # green follow the direction of the sun.
     from benchmarks.worlds.procedural._light import TO_SUN
 
     linear = tree.sh[:, 1:4, 1] @ np.array([TO_SUN[1], -TO_SUN[2], TO_SUN[0]])

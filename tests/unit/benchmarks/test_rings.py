@@ -6,7 +6,7 @@ from v3dg.rotations import rotation_from_quaternion
 
 RING, TUBE = 0.07, 0.04
 FLAT = [1.0, 0.0, 0.0, 0.0]
-UPRIGHT = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]  # its axis along x
+UPRIGHT = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]  # its axis is x
 
 
 def pile_of(positions, quaternions=None, scales=None, **options):
@@ -17,7 +17,7 @@ def pile_of(positions, quaternions=None, scales=None, **options):
 
 
 def nearest_distance(pile, a, b, count=400):
-    """Between the circles of two rings, by brute force."""
+    """Return the distance between the circles of two rings, by brute force."""
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
     rotations = rotation_from_quaternion(pile.quaternions)

@@ -71,7 +71,7 @@ def test_scattered_instances_keep_apart_and_stand_upright(name, radius):
 
 
 def test_temples_do_not_overlap():
-    """Their floors, rectangles of 16 x 28, have no corner in one another's."""
+    """No corner of a floor, which is a rectangle of 16 x 28, lies in another floor."""
     world = worlds.temples(40, 8000)
     placement = world.placements["temple"]
     corners = np.array([[x, y, 0] for x in (-8, 0, 8) for y in (-14, -7, 0, 7, 14)], float)
@@ -205,7 +205,7 @@ def test_an_interrupted_world_goes_on(tmp_path, monkeypatch):
     assert sorted(p.name for p in path.parent.iterdir()) == names
     for name in names:
         assert (whole / name).read_bytes() == (path.parent / name).read_bytes()
-    # Without it, and with other settings, all is made anew.
+    # Without the record, or with other settings, everything is built again.
     worlds.write_world(world, tmp_path / "cut", **options)
     again = (path.parent / "person_00.v3dg").stat().st_mtime_ns
     assert again > first

@@ -1,5 +1,5 @@
-"""BLAKE2b in C++: the same bits as Python's, of one message and of several, on every
-instruction set."""
+"""BLAKE2b in C++ computes the same bits as Python's, for one message and for several,
+with every instruction set."""
 
 import hashlib
 import os
@@ -19,7 +19,7 @@ def messages_of(lengths):
     data = np.random.default_rng(len(lengths)).integers(
         0, 256, max(lengths, default=0) + 64, np.uint8
     )
-    # Hardly one is aligned.
+    # Most of these messages are not aligned.
     return [data[k % 64 : k % 64 + length] for k, length in enumerate(lengths)]
 
 

@@ -1,4 +1,4 @@
-"""The bounds that docs/numerics.md gives for needles and for large gaussians, on
+"""The bounds that docs/numerics.md gives for needles and for large gaussians hold for
 thousands of random ones."""
 
 import dataclasses
@@ -19,8 +19,8 @@ SEEDS = range(60)
 
 
 def needle_case(seed, mode):
-    """COUNT needles of one aspect of 10² to 10⁶, as long as 0.1 to 30 units, and that
-    aspect."""
+    """Return COUNT needles with one aspect ratio of 10² to 10⁶ and lengths of 0.1 to 30
+    units, and that ratio."""
     rng = np.random.default_rng(10_000 + seed)
     aspect = 10.0 ** rng.uniform(2, 6)
     length = 10.0 ** rng.uniform(-1, 1.5)
@@ -36,8 +36,8 @@ def test_needles_without_a_filter_are_as_exact_as_their_aspect_lets_them_be(firs
     for seed in range(first, first + len(SEEDS)):
         case, aspect = needle_case(seed, {})
         largest = max(1e-4, 5e-7 * aspect)
-        # At the cut-off, 3.3 deviations out, an alpha is off by a larger share of
-        # itself.
+        # At the cut-off of 3.3 standard deviations, the relative error of alpha is
+        # larger.
         bound = dataclasses.replace(
             NEEDLES_FLOAT,
             absolute=largest,
@@ -51,8 +51,8 @@ def test_needles_without_a_filter_are_as_exact_as_their_aspect_lets_them_be(firs
 
 
 def gradient_distances(case):
-    """For each input the distance of float32's gradient from float64's, its own norm,
-    and the norm of all."""
+    """Return for each input: the distance of the float32 gradient from the float64
+    gradient, the norm of its own gradient, and the norm of all gradients."""
     import torch
 
     changes = [
@@ -78,8 +78,8 @@ def test_gradients_of_needles_are_as_exact_as_their_aspect_lets_them_be(mode):
 
 @pytest.mark.parametrize("mode", [hard_cases.FILTER, hard_cases.ANTIALIASED], ids=["filter", "aa"])
 def test_small_shares_of_gradients_are_off_by_a_share_of_the_whole(mode):
-    """Gaussians of 10⁶ and more, whose quaternions have next to no influence on a
-    picture that is flat."""
+    """The quaternions of gaussians of 10⁶ units and more hardly influence a uniform
+    picture."""
     pytest.importorskip("torch")
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -93,8 +93,8 @@ def test_small_shares_of_gradients_are_off_by_a_share_of_the_whole(mode):
 
 
 def test_depths_beyond_float32_are_not_drawn(device):
-    """Their places would be those of the principal point, and the picture's depth no
-    number."""
+    """They would be drawn at the principal point, and the depth of the picture would be
+    NaN."""
     turned = scenes.CAMERAS["posed"]
     far = 3.6e38 * turned.viewmat[2, :3]
     beyond = scenes.gaussians(far[None], scales=0.3)
@@ -106,8 +106,8 @@ def test_depths_beyond_float32_are_not_drawn(device):
 
 
 def test_numbers_that_overflow_an_integer_are_no_harm():
-    """Places and extents beyond 2³¹ px: defined, so that the checks of undefined
-    behaviour stay silent."""
+    """Positions and extents beyond 2³¹ px are defined, so UndefinedBehaviorSanitizer
+    reports nothing."""
     means = np.float32(
         [[0, 0, 2], [1e20, 0, 2], [-1e20, 1e20, 2], [0, -1e38, 1], [1e38, 1e38, 1e38]]
     )

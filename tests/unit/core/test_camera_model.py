@@ -1,5 +1,5 @@
-"""The seam for camera models: a second one goes through projection as the pinhole
-does."""
+"""The interface of camera models: a second model is projected with the same code as the
+pinhole."""
 
 import os
 import re
@@ -12,9 +12,9 @@ import pytest
 ROOT = Path(__file__).parents[3]
 CSRC = ROOT / "csrc"
 PROGRAM = ROOT / "tests" / "cpp" / "second_camera.cpp"
-# Folders that make pictures of their own, by a pinhole that they choose themselves; the
-# bindings, which make the cameras of users; and projection, whose kernels for pinholes
-# are separate.
+# Folders that draw pictures with pinhole cameras that they choose themselves; the
+# bindings, which create the cameras of users; and projection, which has separate
+# kernels for pinholes.
 USERS_OF_PINHOLES = {"camera", "fit_group", "levels", "bindings", "project"}
 
 
@@ -24,7 +24,7 @@ def compiler() -> str | None:
 
 @pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
 def test_second_camera_model_goes_through_projection(tmp_path: Path) -> None:
-    """It satisfies the concept, and its ellipses and gradients are those of its
+    """The model satisfies the concept, and its ellipses and gradients agree with its
     formula."""
     program = tmp_path / "second_camera"
     command = [compiler(), "-std=c++20", "-I", CSRC, PROGRAM, "-o", program]
@@ -59,15 +59,15 @@ def test_boxes_of_directions_hold_every_point_of_a_gaussian(tmp_path: Path) -> N
 
 
 def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
-    """All others name Intrinsics, so that another model is a file and its place in
-    camera/camera.h."""
+    """All other code names Intrinsics, so that another model needs only a file and an
+    entry in camera/camera.h."""
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
     users = {p.parent.name for p in sources if "Pinhole<" in p.read_text(encoding="utf-8")}
     assert users == USERS_OF_PINHOLES
 
 
 def test_fields_of_a_pinhole_are_known_to_its_folder_alone() -> None:
-    """Others make a pinhole as a whole, and scale and crop any camera."""
+    """Other folders create a pinhole as a whole, and can scale and crop any camera."""
     field = re.compile(r"\bcamera\.(fx|fy|cx|cy)\b|[;{] *(camera|window)\.(width|height) =")
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
     users = {

@@ -13,7 +13,7 @@ from devices import host, on
 from reference import cluster as reference
 from v3dg import _core
 
-# Few distinct values, so that axes, coordinates and whole points tie.
+# There are few distinct values, so that axes, coordinates and whole points are equal.
 coarse_means = hnp.arrays(
     np.float32,
     st.tuples(st.integers(0, 60), st.just(3)),
@@ -54,7 +54,7 @@ def test_leaves_partition_the_points_evenly(device, num_points, cluster_size, se
     assert num_leaves & (num_leaves - 1) == 0
     assert sizes.max() <= cluster_size
     assert sizes.max() - sizes.min() <= 1
-    # No deeper than needed.
+    # The depth is as small as possible.
     assert num_leaves == 1 or -(-num_points // (num_leaves // 2)) > cluster_size
     np.testing.assert_array_equal(np.sort(order), np.arange(num_points))
     for first, last in itertools.pairwise(leaf_offset):
@@ -69,7 +69,7 @@ def test_runs_agree_with_reference(device, means, unit):
     runs = reference.runs(means, unit)
     np.testing.assert_array_equal(order, [i for run in runs for i in run])
     assert set(leaf_offset) == {0, *np.cumsum([len(run) for run in runs])}
-    # All runs but the last one are full, so each begins at a multiple of the unit.
+    # All runs except the last are full, so each begins at a multiple of the unit.
     assert all(len(run) == unit for run in runs[:-1])
 
 
@@ -170,8 +170,8 @@ def bound(device, spheres, offset):
 
 
 def reaches(ball, spheres):
-    """Distance from the ball's centre to the far side of each sphere, in double
-    precision."""
+    """Return the distance from the ball's centre to the far side of each sphere, in
+    double precision."""
     ball, spheres = ball.astype(np.float64), spheres.astype(np.float64)
     return np.linalg.norm(spheres[:, :3] - ball[:3], axis=1) + spheres[:, 3]
 
@@ -200,7 +200,8 @@ def test_balls_contain_their_spheres_with_margin(device, seed, count, num_segmen
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 100))
 def test_ball_is_nearly_the_smallest(device, seed, count):
     rng = np.random.default_rng(seed)
-    # Points on a unit sphere and their opposites: the smallest ball is the unit ball.
+    # These are points on the unit sphere and their opposites, so the smallest ball is
+    # the unit ball.
     half = rng.normal(size=(count, 3))
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     spheres = np.pad(np.concatenate([half, -half, 0.9 * half]), ((0, 0), (0, 1)))

@@ -1,4 +1,4 @@
-"""Bundles that stay codes give the bits that a bundle of the decoded rows gives."""
+"""Bundles that stay encoded give the same bits as bundles of the decoded rows."""
 
 import dataclasses
 import os
@@ -24,7 +24,7 @@ def small_bundles_stay_codes(monkeypatch):
 
 
 def both(bundle):
-    """The bundle as codes, and as the rows that they are decoded to."""
+    """Return the bundle as codes, and as the decoded rows."""
     codes = Bundle(bundle.clusters, bundle.groups, bundle.gaussians, codec="quantized")
     return codes, Bundle(codes.clusters, codes.groups, codes.gaussians)
 
@@ -41,7 +41,8 @@ def same_bits(first, second):
 
 
 def scenes_of(bundles, seed, count=40):
-    """The same instances of the bundles' codes, of their rows, and of both by turns."""
+    """Return scenes with the same instances: of encoded bundles, of decoded bundles,
+    and of both alternately."""
     rng = np.random.default_rng(seed)
     pairs = [both(bundle) for bundle in bundles]
     poses = [
@@ -173,7 +174,7 @@ def test_a_bundle_keeps_codes_and_no_rows(tmp_path):
     opened = Bundle.open(path)
     render(opened, scenes_lod.random_camera(np.random.default_rng(0)), device="cpu")
     assert opened.codes is opened.codes  # kept
-    assert opened.gaussians is not opened.gaussians  # made anew
+    assert opened.gaussians is not opened.gaussians  # created again
     assert rows.codes is None
     for name, array in vars(opened.gaussians).items():
         assert array.tobytes() == getattr(rows.gaussians, name).tobytes(), name
@@ -181,7 +182,7 @@ def test_a_bundle_keeps_codes_and_no_rows(tmp_path):
 
 @pytest.mark.parametrize(("sh_degree", "most"), [(0, 18), (3, 48)])
 def test_memory_a_gaussian_stays_below_its_bound(device, sh_degree, most):
-    """With clusters as builds make them, of about 170 gaussians, and the tables."""
+    """The clusters have about 170 gaussians, as in builds; the tables count, too."""
     codes, _ = both(lod_bundle(0, sh_degree, 20_000, 256))
     where = _device.resolve(device)
     render(codes, scenes_lod.random_camera(np.random.default_rng(0)), device=device).stats  # noqa: B018
@@ -227,6 +228,6 @@ def test_pages_that_are_none_are_refused():
         with pytest.raises(ValueError, match="expected"):
             _core.Codes(*arguments)
     broken = page.copy()
-    broken.view(np.float32)[6 * codes.num_gaussians] = np.nan  # the first cluster's first mean
+    broken.view(np.float32)[6 * codes.num_gaussians] = np.nan  # the first mean of the first cluster
     with pytest.raises(ValueError, match="cluster 0: expected finite ranges"):
         _core.Codes(broken, one, offset, 1)

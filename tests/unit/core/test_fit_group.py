@@ -1,4 +1,5 @@
-"""Fitting groups to pictures of what they stand for: views, loss, steps."""
+"""Fits of groups to pictures of the gaussians that they replace: views, loss and
+steps."""
 
 import math
 from dataclasses import replace
@@ -16,7 +17,7 @@ torch = pytest.importorskip("torch")
 
 from reference import loss as reference  # noqa: E402
 
-# One view size, and nothing that smooths or shifts the pictures.
+# There is one view size, and pictures are neither smoothed nor shifted.
 PLAIN = BuildConfig(
     image_size=32, supersample=1, filter_px2=0.0, num_views=16, views_per_step=1, first_steps=1000
 )
@@ -29,7 +30,7 @@ CENTER, RADIUS = np.float32([3.0, -2.0, 1.0]), 0.5
 def fit_groups(
     device, start, target, config, target_range, own_range, *, seed=0, streams=None, progress=None
 ):
-    """Fit groups that are all in the ball (CENTER, RADIUS); the result and
+    """Fit groups that all lie in the ball (CENTER, RADIUS); return the result and the
     residuals."""
     num_groups = len(own_range)
     fitted = on(device, copied(start))
@@ -54,7 +55,8 @@ def copied(gaussians):
 
 
 def fit(device, start, target, config, *, seed=0, stream=0, progress=None):
-    """Fit one group; the result and its residual, mean |colour| and |alpha|."""
+    """Fit one group; return the result and its residuals, the mean |colour| and
+    |alpha|."""
     ranges = [[0, len(target)]], [[0, len(start)]]
     fitted, error = fit_groups(
         device, start, target, config, *ranges, seed=seed, streams=[stream], progress=progress
@@ -63,7 +65,7 @@ def fit(device, start, target, config, *, seed=0, stream=0, progress=None):
 
 
 def in_ball(seed, num, **changes):
-    """Gaussians all over the ball."""
+    """Return gaussians throughout the ball."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(num, 3))
     means *= (
@@ -83,8 +85,8 @@ def in_ball(seed, num, **changes):
 
 
 def ball(opacity, color, scale=0.3, sh=None):
-    """One round gaussian at the centre: it looks the same from everywhere, except for
-    `sh` above degree 0."""
+    """Return one round gaussian at the centre. It looks the same from everywhere,
+    except for `sh` above degree 0."""
     return scenes.gaussians(CENTER, scales=scale * RADIUS, opacities=opacity, color=color, sh=sh)
 
 
@@ -95,7 +97,7 @@ def with_bases(g, degree):
 
 
 def view_of_ball(config, direction=(0, 0, 1)):
-    """What any view of PLAIN is, but for a turn."""
+    """Return the picture of PLAIN, which is the same in all views up to a rotation."""
     eye = CENTER.astype(np.float64) - config.distance * RADIUS * np.asarray(direction, np.float64)
     fov = 2 * math.atan(64 / 2 / 88.9)
     return Camera.look_at(
@@ -122,8 +124,8 @@ def test_residual_is_the_mean_difference_in_colour_and_alpha(device):
 
 
 def test_targets_are_supersampled(device):
-    """A gaussian between the pixel centres of a picture is seen at four times the
-    size."""
+    """A gaussian between the pixel centres of a picture is visible at four times the
+    resolution."""
     speck = ball(0.9, (1, 1, 1), scale=0.004)
     nothing = ball(0.0, (0, 0, 0))
     camera = view_of_ball(PLAIN).scaled(4)
@@ -133,10 +135,10 @@ def test_targets_are_supersampled(device):
 
 
 def mean_colour_over_views(device, coefficient, config, **options):
-    """Of one SH coefficient over the views of a residual, in standard deviations over
-    the sphere."""
+    """Return the mean colour of one SH coefficient over the views of a residual, in
+    standard deviations over the sphere."""
     sh = np.zeros((1, 16, 3), np.float32)
-    sh[0, 0] = 0.5 / scenes.SH_C0  # a colour of 1, which keeps all of them above 0
+    sh[0, 0] = 0.5 / scenes.SH_C0  # a colour of 1 keeps all values above 0
     sh[0, coefficient] = 0.2
     bright, nothing = ball(0.9, (1, 1, 1), sh=sh), with_bases(ball(0.0, (0, 0, 0)), 3)
     _, error = fit(device, nothing, bright, replace(config, steps=0), **options)
@@ -145,8 +147,8 @@ def mean_colour_over_views(device, coefficient, config, **options):
 
 @pytest.mark.parametrize("num_views", [1, 16])
 def test_views_held_out_lie_evenly_on_the_sphere(device, num_views):
-    """Up to degree 2, functions on the sphere average out as they do not over 8 random
-    views."""
+    """Functions on the sphere up to degree 2 have a smaller mean over these views than
+    over 8 random views."""
     config = replace(PLAIN, num_views=num_views)
     means = [
         mean_colour_over_views(device, k, config, seed=seed)
@@ -154,7 +156,7 @@ def test_views_held_out_lie_evenly_on_the_sphere(device, num_views):
         for seed in range(3)
     ]
     assert np.abs(means).max() < 0.2
-    assert np.sqrt(np.mean(np.square(means))) < 0.08  # 0.35 if they were random
+    assert np.sqrt(np.mean(np.square(means))) < 0.08  # random views would have 0.35
 
 
 def test_fresh_views_are_random_and_uniform(device):
@@ -163,7 +165,7 @@ def test_fresh_views_are_random_and_uniform(device):
         means = np.array(
             [mean_colour_over_views(device, k, config, stream=stream) for stream in range(100)]
         )
-        assert abs(means.mean()) < 4 * 0.35 / 10  # 4 sigma of 100 means over 8
+        assert abs(means.mean()) < 4 * 0.35 / 10  # 4 standard deviations of 100 means over 8 views
         assert 0.7 < means.std() / 0.35 < 1.3
 
 
@@ -178,7 +180,7 @@ def test_seed_and_stream_change_the_views(device):
 
 @pytest.mark.parametrize("num_views", [1, 4, 29, 58, 64])
 def test_every_view_is_looked_at(device, num_views):
-    """What only some directions show is learnt from views all around."""
+    """Views from all around teach the fit what is visible only from some directions."""
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 0], sh[0, 1:] = 1.0, np.float32([[0.5], [-0.4], [0.3]])
     target = ball(0.9, (0, 0, 0), sh=sh)
@@ -259,8 +261,8 @@ def test_wrong_pictures_are_refused(picture, target):
 )
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_steps_are_those_of_adam(device, weights, views_per_step):
-    """A ball that looks the same from everywhere, fitted by torch.optim.Adam on
-    differentiable pictures."""
+    """A ball that looks the same from everywhere is also fitted with torch.optim.Adam
+    and differentiable pictures."""
     steps = 25
     config = replace(
         PLAIN,
@@ -298,7 +300,7 @@ def test_steps_are_those_of_adam(device, weights, views_per_step):
 
 
 def test_first_step_has_the_sizes_that_were_set(device):
-    """Adam's first step is as long as set, whatever the gradient."""
+    """The first step of Adam has the length that was set, whatever the gradient is."""
     steps = {"step_position": 1e-3, "step_log_scale": 2e-3, "step_logit": 3e-3, "step_sh0": 4e-3}
     start, target = in_ball(2, 12), in_ball(3, 12)
     config = replace(
@@ -306,7 +308,7 @@ def test_first_step_has_the_sizes_that_were_set(device):
     )
     start, target = with_bases(start, 1), with_bases(target, 1)
     fitted, _ = fit(device, start, target, config)
-    assert not np.array_equal(fitted.sh, start.sh)  # it was better than the start
+    assert not np.array_equal(fitted.sh, start.sh)  # it is better than the start
 
     def logit(x):
         return np.log(x / (1 - x))
@@ -346,7 +348,7 @@ def test_longer_fits_come_closer(device, changes):
 
 def test_result_no_better_than_its_start_is_thrown_away(device):
     target = in_ball(6, 20)
-    # Far better than nothing at all.
+    # The fit is far better than no gaussians at all.
     start = scenes.replaced(target, sh=target.sh + np.float32(0.05))
     _, before = fit(device, start, target, replace(PLAIN, steps=0))
     for step in ("step_position", "step_log_scale", "step_logit", "step_sh0"):
@@ -356,8 +358,8 @@ def test_result_no_better_than_its_start_is_thrown_away(device):
 
 
 def test_result_that_pleases_only_the_views_it_was_fitted_to_is_thrown_away(device):
-    """The target is red from one side; the start has its mean colour, which fits all
-    around best."""
+    """The target is red from one side. The start has its mean colour, which is the best
+    fit over all views."""
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 0], sh[0, 1:, 0] = 1.0, [0.4, -0.4, 0.4]
     target = ball(0.9, (0, 0, 0), sh=sh)
@@ -381,19 +383,20 @@ def test_result_that_pleases_only_the_views_it_was_fitted_to_is_thrown_away(devi
     ],
 )
 def test_nothing_runs_away(device, step, target):
-    """A target outside the ball, larger than it, or opaque, that is fitted in steps as
-    large."""
+    """The target is outside the ball, larger than the ball or opaque, and is fitted
+    with large steps."""
     start = ball(0.3, (1, 1, 1))
     out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 30.0}, steps=3))
     _, before = fit(device, start, target, replace(PLAIN, steps=0))
-    assert error.sum() < before.sum()  # it was kept
+    assert error.sum() < before.sum()  # the start was kept
     assert np.abs(out.means - CENTER).max() <= RADIUS * (1 + 1e-6)
     assert out.scales.max() <= RADIUS * (1 + 1e-6)
     assert out.opacities.max() <= 1 - 0.99e-4
 
 
 def test_groups_do_not_touch_each_other(device):
-    """Two groups at once give what each gives alone, with its own stream."""
+    """Two groups at once have the same results as each alone with its own stream of
+    random numbers."""
     starts, targets = [in_ball(8, 12), in_ball(9, 7)], [in_ball(10, 30), in_ball(11, 20)]
     config = replace(PLAIN, steps=10)
     alone = [
@@ -455,7 +458,7 @@ def test_wrong_groups_are_named(change, message):
 
 
 def fit_one_group(start, target, change):
-    """Call the core, one argument or more being another."""
+    """Call the core with one or more arguments exchanged."""
     arguments = {
         "config": fit_config(PLAIN, 0, 0),
         "target": _core.FitTarget(target.rows, 0.0, False),
@@ -514,8 +517,8 @@ def test_what_is_fitted_has_to_be_where_its_target_is():
 )
 @pytest.mark.parametrize("steps", [0, 1, 5])
 def test_devices_agree(num, num_target, degree, changes, steps):
-    """Rounding moves nearly nothing; Adam makes whole steps out of gradients that are
-    all rounding."""
+    """Rounding changes most results hardly. Adam, however, makes whole steps from
+    gradients that consist of rounding only."""
     start = with_bases(in_ball(16, num), degree)
     target = with_bases(in_ball(17, num_target), degree)
     config = replace(PLAIN, steps=steps, **changes)

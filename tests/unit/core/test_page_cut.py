@@ -1,5 +1,5 @@
-"""The cut of a scene of which only some pages are resident: exact, and it tells what it
-misses."""
+"""The cut of a scene of which only some pages are resident. It is exact, and it reports
+the pages that it misses."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,8 @@ fades = st.sampled_from([None, 1.05, 4.0])
 
 
 def scene_of(rng, *, sh_degree=0):
-    """Instances of two bundles: one as a build lays it out, and a tree of any shape."""
+    """Return instances of two bundles: one has the layout of a build, and the other is
+    a tree of any shape."""
     asset = blob(rng, int(rng.integers(1, 400)), sh_degree=sh_degree)
     scene = random_scene(rng, lod_bundle(rng, asset, int(rng.integers(2, 30))), 5)
     tree = random_bundle(
@@ -48,13 +49,13 @@ def scene_of(rng, *, sh_degree=0):
 
 
 def partly_there(rng, scene):
-    """Of each bundle: which pages are there, and where."""
+    """Return for each bundle which pages are resident, and where."""
     there = [closed_residency(rng, bundle) for bundle in scene.bundles]
     return there, [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
 
 
 def a_tolerance(rng, scene, camera):
-    """The metric of some group, or about that."""
+    """Return the metric of some group, or a value near it."""
     metrics = np.concatenate(group_metrics(scene, camera))
     metrics = metrics[np.isfinite(metrics)]
     return float(rng.choice(metrics)) * float(rng.choice([1.0, 0.7])) if len(metrics) else 1.0
@@ -62,7 +63,7 @@ def a_tolerance(rng, scene, camera):
 
 @pytest.mark.parametrize("fades", [False, True])
 def test_every_path_has_exactly_one_cluster(device, fades):
-    """With fades, weights that add up to exactly one."""
+    """With fades, the weights on a path add up to exactly one."""
     result = run_trials(200_000, device=device, partial=True, fades=fades)
     assert result["violations"] == 0
     assert result.get("pages_that_fade_in", 100) >= 100
@@ -121,7 +122,7 @@ def test_groups_are_refined_as_far_as_their_pages_have_faded_in(seed, fade):
 
 @pytest.mark.parametrize("fade", [None, 1.3])
 def test_violations_would_be_counted(fade):
-    """Pages without those above them: a cut that is drawn twice."""
+    """Pages without their ancestors would make a cut that is drawn twice."""
     rng = np.random.default_rng(0)
     bundle = random_trees(rng)[0]
     number, whole = numbers_of_clusters(bundle, rng)
@@ -178,7 +179,7 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     whole = select(scene, camera, device="cpu", **options)
     there = [closed_residency(rng, bundle, share=0.3) for bundle in scene.bundles]
     shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
-    core = resident_scene(scene, shifts)  # which borrows the arrays
+    core = resident_scene(scene, shifts)  # the result borrows the arrays
     asked = [np.zeros(len(shift), bool) for shift in shifts]
     for _ in range(100):
         needs = core.page_needs(camera.core, rule(**options))
@@ -191,7 +192,7 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
             ever[pages] = True
         for bundle, shift, pages in zip(scene.bundles, shifts, missing, strict=True):
             for page in pages:
-                while shift[page] == ABSENT:  # with all above it
+                while shift[page] == ABSENT:  # with all ancestors
                     shift[page] = 0
                     page = bundle.groups.parent[page]
     cut = core.select(camera.core, rule(**options))
@@ -199,10 +200,10 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
     np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
     np.testing.assert_array_equal(weights_of(cut), whole.weights)
-    # What was missed is still needed, or is above what nearly is. Else it would go, and
-    # be missed again.
+    # Missing pages are still needed, or are ancestors of pages that are nearly needed.
+    # Otherwise they would be evicted and be missing again.
     for bundle, ever, need in zip(scene.bundles, asked, needs, strict=True):
-        above = np.append(bundle.groups.parent, -1)  # of the coarsest page nothing is
+        above = np.append(bundle.groups.parent, -1)  # the coarsest page never counts
         needed = np.zeros(len(ever), bool)
         for asking in np.flatnonzero(need > 0):
             page = asking if need[asking] > 1 else above[asking]
@@ -285,8 +286,8 @@ def test_both_devices_choose_the_same_of_what_is_there():
 
 @pytest.mark.parametrize("fade", [None, 1.5])
 def test_pages_are_drawn_from_wherever_they_lie(device, fade):
-    """The same cut of the same pages, in order and in any order with other rows in
-    between."""
+    """The cut of the same pages is the same if they lie in any order, with other rows
+    in between."""
     rng = np.random.default_rng(2)
     for _ in range(5):
         scene = Scene()
@@ -312,7 +313,7 @@ def test_pages_are_drawn_from_wherever_they_lie(device, fade):
 
 
 def moved_rows(bundle, shift, num_rows):
-    """The bundle's gaussians at their places; what is in between is poison."""
+    """Return the bundle's gaussians at their places, with NaN in between."""
     count = max(num_rows, bundle.num_gaussians)
     arrays = {
         n: np.full((count, *a.shape[1:]), np.nan, np.float32)

@@ -16,7 +16,7 @@ FILTERS = pytest.mark.parametrize("filter_px2", make_golden.FILTERS_PX2)
 
 
 def golden(name):
-    """Gaussians, camera and gsplat's answers for one golden scene."""
+    """Return the gaussians, the camera and gsplat's results of one golden scene."""
     answers = {key.split("/")[1]: GOLDEN[key] for key in GOLDEN.files if key.startswith(name + "/")}
     gaussians = Gaussians(*(answers.pop(key) for key in scenes.NAMES))
     return gaussians, scenes.CAMERAS[name], answers
@@ -126,7 +126,8 @@ def test_golden_file_is_what_gsplat_says(name):
 
 
 def test_reference_harmonics_are_orthonormal():
-    # Gauss-Legendre in z, uniform in angle: exact for products of degree 3.
+    # This quadrature, Gauss-Legendre in z and uniform in the angle, is exact for
+    # products of degree 3.
     z, weight = np.polynomial.legendre.leggauss(8)
     angle = 2 * np.pi * np.arange(16) / 16
     radius = np.sqrt(1 - z * z)[:, None]

@@ -1,5 +1,5 @@
-"""Codes of gaussians: bounds that follow from the steps, the formula written anew, and
-extreme clusters."""
+"""Codes of gaussians: error bounds that follow from the steps, a second implementation
+of the formula, and extreme clusters."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ DEGREES = (0, 1, 2, 3)
 
 
 def random_clusters(seed, sh_degree, num_clusters=6, most=60):
-    """Gaussians as they are in assets, in clusters of a unit of length somewhere; and
-    where those begin."""
+    """Return gaussians as in assets, in clusters of a unit of length at random places,
+    and where the clusters begin."""
     rng = np.random.default_rng(seed)
     sizes = rng.integers(1, most, num_clusters)
     n = int(sizes.sum())
@@ -48,7 +48,8 @@ def rounded(gaussians, offset):
 
 
 def ranges_of(values, offset):
-    """(N, ...) least and largest value of each one's cluster."""
+    """Return the least and the largest value (N, ...) in the cluster of each
+    gaussian."""
     sizes = np.diff(offset)
     least, most = (
         np.repeat(f.reduceat(values, offset[:-1], axis=0), sizes, 0)
@@ -74,8 +75,8 @@ def covariances(gaussians):
 def test_errors_are_those_of_the_steps(seed, sh_degree):
     gaussians, offset = random_clusters(seed, sh_degree)
     out = rounded(gaussians, offset)
-    # Half a step; at the upper end, the step's rounding to 12 bits adds up to two
-    # steps; float32 rounds last.
+    # The bound is half a step, and up to two steps at the upper end, because the step
+    # is rounded to 12 bits. Finally float32 rounds.
     least, most = ranges_of(gaussians.means, offset)
     step = (most - least) / 4095
     error = np.abs(out.means - gaussians.means.astype(np.float64))
@@ -84,7 +85,8 @@ def test_errors_are_those_of_the_steps(seed, sh_degree):
         error <= np.where(at_end, 2.5, 0.501) * step + np.spacing(np.abs(most).astype(np.float32))
     ).all()
     assert np.abs(out.opacities - gaussians.opacities).max() <= 0.5 / 255 + 1e-7
-    # Half a step, or what rounding the ends of the range inwards to float16 leaves out.
+    # The bound is half a step, or the part that is lost where the ends of the range are
+    # rounded inwards to float16.
     least, most = ranges_of(gaussians.sh[:, 0], offset)
     ends = np.maximum(np.abs(least), np.abs(most)) * 2.0**-10
     error = np.abs(out.sh[:, 0] - gaussians.sh[:, 0].astype(np.float64))
@@ -93,18 +95,18 @@ def test_errors_are_those_of_the_steps(seed, sh_degree):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_shapes_keep_to_their_steps(seed):
-    """Axes may have another order, so covariances are compared."""
+    """Covariances are compared, because the axes may have another order."""
     gaussians, offset = random_clusters(seed, 0)
     out = rounded(gaussians, offset)
-    # Half a step of the bits of floats is at most so much of a scale; the ends of the
-    # range are 2^-8 coarser.
+    # Half a step in the bits of floats is at most this relative error of a scale; the
+    # ends of the range are coarser by 2^-8.
     bits = gaussians.scales.view(np.int32)
     least, most = ranges_of(np.stack([bits.min(1), bits.max(1)], axis=1), offset)
     relative = 0.5 * (most[:, 1] - least[:, 0]) / 1023 * 2.0**-23 + 2.0**-8
     error = np.abs(np.sort(out.scales, axis=1) / np.sort(gaussians.scales, axis=1) - 1).max(axis=1)
     assert (error <= relative).all()
-    # Three components half a step of 1/666 off, w at least 0.75: an angle of 2 sqrt(3)
-    # / 1332 / 0.75.
+    # Three components have an error of half a step of 1/666 and w is at least 0.75, so
+    # the angle is at most 2 sqrt(3) / 1332 / 0.75.
     angle = 2 * np.sqrt(3) * 0.5 / 666 / 0.74
     expected, got = covariances(gaussians), covariances(out)
     largest = gaussians.scales.max(axis=1).astype(np.float64) ** 2
@@ -126,7 +128,8 @@ def test_small_coefficients_have_small_steps(sh_degree):
             largest = ranges_of(np.abs(value).max(axis=1), offset)[1][:, None]
             most = 2 ** (reference.sh_bits(sh_degree, band)[channel] - 1) - 1
             unit = largest / most**2
-            # Between squares n² and (n+1)² of a unit that float16 has to 2^-11.
+            # Steps are between the squares n² and (n+1)² of a unit that float16 stores
+            # with a relative error of 2^-11.
             assert (
                 error <= unit * (np.sqrt(np.abs(value) / unit) + 0.5) + largest * 2.0**-10
             ).all()
@@ -134,8 +137,8 @@ def test_small_coefficients_have_small_steps(sh_degree):
 
 @pytest.mark.parametrize("sh_degree", DEGREES)
 def test_the_formula_is_that_of_the_reference(sh_degree):
-    """Bit for bit, also where products are not rounded before they are added: no code
-    needs it."""
+    """The bits agree also if products are not rounded before they are added, because no
+    code depends on it."""
     gaussians, offset = random_clusters(9, sh_degree)
     page = _core.encode_page(gaussians.rows, offset)
     out = decoded(page, offset, gaussians)
@@ -146,8 +149,8 @@ def test_the_formula_is_that_of_the_reference(sh_degree):
 
 
 def extreme_clusters(rng, n, sh_degree):
-    """Any floats that a bundle can hold: alike, tiny, huge, far from the origin, of
-    every size at once."""
+    """Return clusters of any floats that a bundle can contain: equal, tiny, huge, far
+    from the origin, and of all sizes together."""
 
     def values(*shape):
         exponent = rng.integers(-38, 39)
@@ -176,8 +179,8 @@ def extreme_clusters(rng, n, sh_degree):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_extreme_clusters_become_finite_gaussians_that_stay_as_they_are(seed):
-    """What was decoded gives the same page again: an interrupted build goes on with
-    what it would have."""
+    """Decoded gaussians are encoded to the same page again, so an interrupted build
+    continues with the same values."""
     rng = np.random.default_rng(seed)
     for _ in range(150):
         n, sh_degree = int(rng.integers(1, 40)), int(rng.integers(0, 4))
@@ -219,7 +222,7 @@ def test_scales_of_all_sizes_keep_their_order_of_magnitude():
     )
     gaussians.quats[:] = [1, 0, 0, 0]
     out = rounded(gaussians, np.array([0, n]))
-    # Of 80 octaves.
+    # The range spans 80 octaves.
     np.testing.assert_allclose(out.scales, gaussians.scales, rtol=0.5 * 80 / 1023 + 2.0**-8)
 
 
@@ -275,7 +278,7 @@ def test_wrong_arguments_are_refused():
             _core.encode_page(gaussians.rows, wrong)
     with pytest.raises(ValueError, match="sh_degree: expected 0 to 3"):
         _core.page_code_bytes(4)
-    page[-12] = 0x7FC00000  # the means' least, in the ranges of the last cluster
+    page[-12] = 0x7FC00000  # the least mean in the ranges of the last cluster
     page.view(np.float32)[4 * len(gaussians)] = np.nan
     with pytest.raises(ValueError, match="cluster 0 of the page: expected finite ranges"):
         _core.decode_page(page, offset, gaussians.rows)

@@ -1,4 +1,4 @@
-"""A quaternion's length is no part of what it says: forward, backward, in scenes and in
+"""The length of a quaternion has no influence: forward, backward, in scenes and in
 files."""
 
 import numpy as np
@@ -11,13 +11,14 @@ from devices import host, on
 from v3dg.rotations import normalised
 from v3dg.viewer.view import View
 
-# Products with powers of two are exact, also where few bits are left.
+# Products with powers of two are exact, also if few bits are left.
 QUATS = np.array([[5, -3, 7, 2], [1, 6, -2, 4], [-7, 1, 0, 3], [0, 0, 5, 4]], np.float32) / 8
 EXPONENTS = (-125, -110, -86, -70, -64, -50, -41, -39, 39, 41, 49, 52, 63, 66, 100, 126)
 
 
 def crowd_turned_by(factor):
-    """Ordinary gaussians that are turned by QUATS, which are `factor` times as long."""
+    """Return ordinary gaussians that are rotated by QUATS, which are multiplied by
+    `factor`."""
     num = hard_cases.NUM
     return hard_cases.crowd(5, quats=np.float32(factor) * np.resize(QUATS, (num, 4)))
 
@@ -59,7 +60,7 @@ def test_gradients_grow_as_one_over_the_length(device, exponent):
     expected[1] = expected[1] * 2.0**-exponent
     assert expected[1].any()
     for name, e, g in zip(scenes.NAMES, expected, got, strict=True):
-        # What is below the least normal number is rounded to what there is.
+        # Values below the least normal number are rounded to subnormal numbers.
         np.testing.assert_allclose(g, e, rtol=1e-6, atol=1e-37, err_msg=name)
 
 
@@ -120,7 +121,7 @@ def test_instances_are_placed_unless_zero_or_not_finite(quaternion, is_drawn):
     asset = scenes.gaussians([[0.0, 0.0, 0.0]], scales=0.3)
     scene = v3dg.Scene.of(v3dg.build_bundle(asset, device="cpu", progress=False))
     camera = v3dg.Camera.look_at((0, -3, 0), (0, 0, 0), width=32, height=32)
-    # As poses on a CUDA device are, which nobody has looked at.
+    # Poses on a CUDA device are not checked before they are drawn.
     scene._state = scene._state._replace(quaternions=np.array([quaternion], np.float64))
     image = v3dg.render(scene, camera, tolerance=0.0, device="cpu")
     assert (image.alpha.max() > 0.5) == is_drawn

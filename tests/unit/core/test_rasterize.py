@@ -49,7 +49,7 @@ def torch():
 
 
 def draw(device, gaussians, camera, **mode):
-    """The picture drawn on `device`, as NumPy arrays."""
+    """Return the picture that `device` draws, as NumPy arrays."""
     raster = v3dg.rasterize(on(device, gaussians), camera, **mode)
     return v3dg.Image(*host((raster.color, raster.alpha, raster.depth)))
 
@@ -63,7 +63,7 @@ def digest(raster):
     return hashlib.sha256(b"".join(a.tobytes() for a in arrays)).hexdigest()
 
 
-# Agreement with the reference
+# Agreement with the reference.
 
 
 @CAMERAS
@@ -177,7 +177,7 @@ def test_every_image_size(device, size):
 
 @st.composite
 def wild_gaussian(draw):
-    """One gaussian anywhere, of any shape, seen by any of the cameras."""
+    """Return one gaussian of any shape at any place that one of the cameras sees."""
     log_scale = st.floats(-5, 1.5)
     place = st.floats(-3, 3, width=32)
     return scenes.gaussians(
@@ -204,7 +204,7 @@ def test_tiles_lose_no_pixel_of_any_gaussian(gaussian, size, center, filter_px2)
     )
 
 
-# Where pixels stop
+# Where pixels stop.
 
 
 def draw_stopped(device, gaussians, camera, min_transmittance, **mode):
@@ -225,14 +225,14 @@ def test_pixels_stop_behind_the_one_that_hides_the_rest(device, min_transmittanc
 
 @pytest.mark.parametrize("min_transmittance", [1e-4, 1e-3, 1e-2])
 def test_no_more_light_is_lost_than_asked_for(device, min_transmittance):
-    """Also where gaussians are opaque, which takes all light but a thousandth at
+    """This also holds for opaque gaussians, which take all light except a thousandth at
     once."""
     camera = scenes.CAMERAS["plain"]
     loose = scenes.trained_like(31, camera, 2000)
     gaussians = scenes.replaced(
         loose,
         opacities=np.where(np.arange(len(loose)) % 2 == 0, np.float32(1), loose.opacities),
-        sh=np.clip(loose.sh, -0.2, 0.2),  # colours of 0 to 1
+        sh=np.clip(loose.sh, -0.2, 0.2),  # colours from 0 to 1
     )
     whole = draw_stopped(device, gaussians, camera, 0.0)
     picture = draw_stopped(device, gaussians, camera, min_transmittance)
@@ -256,13 +256,14 @@ def test_assets_are_drawn_as_rasterized_unless_asked(device):
     gaussians = scenes.trained_like(33, camera, 600)
     rendered = draw_stopped(device, gaussians, camera, None)
     expected = draw(device, gaussians, camera)
-    # On CUDA an asset is drawn from covariances made beforehand, which round otherwise.
+    # On CUDA, an asset is drawn from covariances that were computed before, with other
+    # rounding.
     assert np.abs(rendered.color - expected.color).max() <= 1e-5
     stopped = draw_stopped(device, gaussians, camera, 1e-3)
     assert np.abs(stopped.color - expected.color).max() > 1e-4
 
 
-# Properties
+# Properties.
 
 
 def test_gaussian_nearer_than_near_is_not_drawn(device):
@@ -306,8 +307,8 @@ def test_equal_depths_are_drawn_in_the_order_of_their_index(device):
 
 
 def test_depths_too_far_apart_for_an_entry_keep_their_order(torch):
-    # 30 bits of depth and 23 of places are one more than an entry has, so that
-    # neighbours in depth tie.
+    # 30 bits of depth and 23 bits of records are one bit more than an entry has, so
+    # neighbours in depth become equal.
     count = 4_300_000
     generator = np.random.default_rng(1)
     depths = (np.float32(0.02).view(np.uint32) + generator.integers(0, 64, count)).astype(np.uint32)
@@ -323,9 +324,9 @@ def test_depths_too_far_apart_for_an_entry_keep_their_order(torch):
     pictures = []
     for gaussians in (near, v3dg.Gaussians.concatenate([near, far])):
         leaf = gaussians.torch("cpu")
-        leaf.opacities.requires_grad_(True)  # so that the picture is drawn in one go
+        leaf.opacities.requires_grad_(True)  # so that the picture is drawn as a whole
         pictures.append(v3dg.rasterize(leaf, camera).color.detach().numpy())
-    np.testing.assert_array_equal(*pictures)  # all stops in front of what is far
+    np.testing.assert_array_equal(*pictures)  # every pixel stops in front of the far gaussians
 
 
 def test_order_of_the_arrays_does_not_matter(device):
@@ -371,7 +372,7 @@ def test_antialiased_keeps_what_a_small_gaussian_adds_to_the_picture(device):
     assert abs(kept - sharp) < 0.1 * sharp
 
 
-# Kinds of arrays and wrong arguments
+# Kinds of arrays, and wrong arguments.
 
 
 def test_numpy_in_numpy_out():
@@ -458,11 +459,11 @@ def test_wrong_arguments_are_refused(mode, message):
         v3dg.rasterize(scenes.gaussians([0, 0, 1.0]), scenes.camera(), **mode)
 
 
-# Gradients
+# Gradients.
 
 
 def weighted_sum(torch, raster, seed=0):
-    """A number that every pixel of colour, alpha and depth has a part in."""
+    """Return a number that depends on every pixel of colour, alpha and depth."""
     rng = np.random.default_rng(seed)
     parts = [raster.color, raster.alpha, raster.depth] if hasattr(raster, "color") else raster
     return sum((p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p)).sum() for p in parts)
@@ -535,7 +536,7 @@ def test_gradients_are_finite_differences(torch, name, mode):
         for _ in range(4):
             direction = torch.randn(inputs[i].shape, generator=generator, dtype=torch.float64)
             if input_name == "scales":
-                direction *= inputs[i].detach()  # steps in proportion: no scale changes sign
+                direction *= inputs[i].detach()  # steps are relative, so no scale changes its sign
             values = []
             for sign in (1, -1):
                 moved = [t.detach() for t in inputs]
@@ -572,8 +573,8 @@ def test_each_coordinate_is_its_finite_difference(torch):
 
 
 def gradients_of(torch, gaussians, camera, dtype, device, *, background=BACKGROUND, **mode):
-    """Gradients of weighted_sum by the five inputs and the background, as NumPy
-    arrays."""
+    """Return the gradients of weighted_sum by the five inputs and the background, as
+    NumPy arrays."""
     inputs = leaves(torch, gaussians, background, dtype, device)
     return host(
         torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
@@ -605,7 +606,7 @@ def test_gradients_of_every_degree(torch, device, sh_degree):
 
 @GRADIENT_MODES
 def test_gradients_over_many_tiles(torch, device, mode):
-    """Gaussians over hundreds of tiles beside such of a pixel, and pixels that stop
+    """Some gaussians cover hundreds of tiles and some a pixel, and some pixels stop
     early."""
     camera = scenes.camera(517, 389, fx=300.0, pose=scenes.pose(9))
     small = scenes.random_gaussians(
@@ -769,12 +770,12 @@ def test_gradient_descent_finds_a_moved_gaussian(torch, device):
         decay.step()
     x, y, depth = start.means.detach()[0].tolist()
     np.testing.assert_allclose([x / depth, y / depth], [0.075, -0.05], atol=0.001)
-    # Larger than the target: it goes where it looks as small.
+    # The gaussian is larger than the target, so it moves to where it looks as small.
     np.testing.assert_allclose(depth, 2.5, atol=0.05)
 
 
 def draw_with_gsplat(gsplat, torch, inputs, camera, filter_px2, antialiased=False):
-    """gsplat's colour, alpha and expected depth of the five inputs before the
+    """Return gsplat's colour, alpha and expected depth of the five inputs before the
     background."""
     view, K = (
         torch.tensor(m, dtype=torch.float32, device="cuda")[None]
@@ -798,7 +799,7 @@ def draw_with_gsplat(gsplat, torch, inputs, camera, filter_px2, antialiased=Fals
 
 @pytest.mark.gpu
 @pytest.mark.witness
-@pytest.mark.filterwarnings("ignore")  # of what gsplat imports
+@pytest.mark.filterwarnings("ignore")  # because of what gsplat imports
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("sh_degree", [0, 3])
 def test_pictures_and_gradients_are_gsplats(torch, antialiased, sh_degree):
@@ -811,8 +812,8 @@ def test_pictures_and_gradients_are_gsplats(torch, antialiased, sh_degree):
     theirs = draw_with_gsplat(gsplat, torch, inputs, camera, **mode)
     for got, expected in zip((ours.color, ours.alpha), theirs[:2], strict=True):
         error = (got - expected).abs()
-        # A contribution at the threshold of 1/255, or the one at which a pixel stops,
-        # may be taken or left.
+        # A contribution at the threshold of 1/255, or one at which a pixel stops, may
+        # or may not be blended.
         assert error.max() < PICTURE_FLOAT.flip
         assert (error > 1e-3).float().mean() < 1e-3
     got = host(torch.autograd.grad(weighted_sum(torch, ours), inputs))
@@ -822,7 +823,7 @@ def test_pictures_and_gradients_are_gsplats(torch, antialiased, sh_degree):
         assert_gradients_agree(g, e, GRADIENT_GSPLAT)
 
 
-# The same on every run and machine
+# The same bits in every run and on every machine.
 
 RUN = """
 import sys
@@ -848,8 +849,8 @@ np.savez(sys.argv[1], *out[0])
 
 
 def run_elsewhere(path, what, **environment):
-    """Arrays that RUN makes in a process of its own, or None where the processor lacks
-    the instructions."""
+    """Return the arrays that RUN computes in its own process; None if the processor
+    lacks the instructions."""
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(path), what],
         env=TESTS_ENVIRONMENT | environment,

@@ -24,7 +24,8 @@ from v3dg import BuildConfig, Bundle, Camera, Gaussians, Scene, _core, build_bun
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 seeds = st.integers(0, 2**32 - 1)
-# Where the scene lies, how far the cameras are from it: far, within, at the very place.
+# The position of the scene, and the distance of the cameras from it: far, inside, at
+# the same place.
 places = st.sampled_from(
     [(0.0, 5.0), (0.0, 100.0), (0.0, 0.3), (0.0, 1e6), (1e6, 5.0), (-3e9, 50.0)]
 )
@@ -41,7 +42,7 @@ def same(a, b):
 
 @st.composite
 def bundles(draw):
-    """Random trees of any shape, or bundles laid out as a build does."""
+    """Return random trees of any shape, or bundles with the layout of a build."""
     seed = draw(seeds)
     if draw(st.booleans()):
         return random_bundle(seed, num_levels=draw(st.integers(0, 5)))
@@ -59,7 +60,8 @@ def bundles(draw):
 
 
 def tolerances_of(draw, scene, camera):
-    """0, infinity, anything between, and exactly the metric of a group."""
+    """Return the tolerances 0, infinity, values in between, and exact metrics of
+    groups."""
     metrics = np.concatenate([*group_metrics(scene, camera), np.zeros(1, np.float32)])
     exact = float(draw(st.sampled_from(sorted(set(metrics.tolist())))))
     return draw(st.sampled_from([0.0, exact, np.inf, 1e-3, 0.5, 1e4]))
@@ -91,7 +93,7 @@ def test_metric_never_decreases_towards_the_root(bundle, seed, place):
     rng = np.random.default_rng(seed)
     scene = random_scene(rng, bundle, 4, origin=origin)
     if len(bundle.groups):
-        # The eye within a ball, and at its very surface.
+        # The eye is inside a ball, and on its surface.
         ball = bundle.groups.ball[rng.integers(len(bundle.groups))].astype(np.float64)
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
@@ -112,8 +114,8 @@ def test_metrics_agree_with_reference(seed, footprint, place):
     for i, metric in enumerate(group_metrics(scene, camera, footprint=footprint)):
         expected = np.array(reference.metrics(scene, i, camera, footprint))
         if footprint == "solid_angle":
-            # Near a ball's surface the area is steep in the distance, which float32
-            # holds to 1e-7.
+            # Near the surface of a ball, the area is a steep function of the distance,
+            # whose relative error in float32 is 1e-7.
             near = np.array(
                 [
                     footprint_is_steep(ball, reference.eye_in_instance(scene, i, camera))
@@ -199,7 +201,7 @@ def test_turning_the_camera_changes_nothing(bundle, seed):
     scene = random_scene(rng, bundle, 3)
     camera = Camera(np.eye(4), np.diag([500.0, 500.0, 1.0]), 64, 48)
     for angle in rng.uniform(0, 2 * np.pi, 3):
-        # A turn about the eye at the origin: exact, so that not a bit may change.
+        # A rotation about the eye at the origin is exact, so no bit may change.
         viewmat = np.eye(4)
         viewmat[:3, :3] = [
             [np.cos(angle), 0, np.sin(angle)],
@@ -248,7 +250,7 @@ def test_moving_scene_and_camera_together_changes_nothing(shift):
 
 
 def frames(gaussians, scene, i, camera):
-    """Means and covariances in camera space, in double precision."""
+    """Return means and covariances in camera space, in double precision."""
     turn = camera.viewmat[:3, :3] @ scene.rotations[i]
     means = (
         scene.scales[i] * gaussians.means.astype(np.float64) @ scene.rotations[i].T
@@ -283,9 +285,9 @@ def test_frustum_never_drops_what_a_pixel_shows(seed, distance, off_center):
 
 @pytest.mark.parametrize("side", range(4))
 def test_frustum_keeps_needles_whose_image_leans_in(side):
-    # The needle lies beside the image and along its edge, past the eye. Its projection
-    # is linearised at its mean, outside the image, so its picture lies across the edge
-    # although the needle itself does not.
+    # The needle lies beside the picture and along its border, past the eye. Its
+    # projection is linearised at its mean, which is outside the picture, so it is drawn
+    # across the border although the needle itself is not there.
     asset = Gaussians(
         means=np.zeros((1, 3), np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),
@@ -294,7 +296,8 @@ def test_frustum_keeps_needles_whose_image_leans_in(side):
         sh=np.ones((1, 1, 3), np.float32),
     )
     bundle = lod_bundle(np.random.default_rng(0), asset, 1, past_root=0)
-    # An eighth of a turn about y, then a quarter of one about the view for each side.
+    # The rotation is an eighth of a turn about y, then a quarter of a turn about the
+    # view direction for each side.
     (w, z), (c, y) = ((np.cos(a), np.sin(a)) for a in (side * np.pi / 4, np.pi / 8))
     turn = rotation_matrices(np.array([[w, 0, 0, z]]))[0]
     scene = Scene()
@@ -323,8 +326,7 @@ def test_frustum_drops_most_of_what_lies_outside():
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("num_bundles", [8, 9, 40])
 def test_bundles_of_different_filters_are_cut_as_if_alone(device, num_bundles):
-    # A wide filter reaches far beyond the frustum, so each bundle has a frustum of its
-    # own.
+    # A wide filter reaches far beyond the frustum, so each bundle has its own frustum.
     rng = np.random.default_rng(num_bundles)
     scene = Scene()
     for b in range(num_bundles):
@@ -343,7 +345,7 @@ def test_bundles_of_different_filters_are_cut_as_if_alone(device, num_bundles):
         np.testing.assert_array_equal(cut.instance_ids[own], mine[expected.instance_ids])
         np.testing.assert_array_equal(cut.cluster_ids[own], expected.cluster_ids)
         kept.append(len(expected))
-    assert max(kept[:8]) > 1.5 * min(kept[:8])  # or the filters would not matter here
+    assert max(kept[:8]) > 1.5 * min(kept[:8])  # otherwise the filters would not matter here
 
 
 @given(bundle=bundles(), other=bundles(), seed=seeds)
@@ -457,8 +459,8 @@ OPTIONS = [{}, {"fade": 1.3}, {"min_level": 7}, {"footprint": "paper"}]
 
 
 def lane_scene(count):
-    """Instances that need a table, its last clusters or their tops alone, in every
-    order; and a camera."""
+    """Return a camera, and instances that need a table, its last clusters, or only its
+    coarsest clusters, in every order."""
     rng = np.random.default_rng(count)
     config = BuildConfig(cluster_size=32, steps=0, num_views=1)
     made = [build_bundle(blob(rng, size), config=config, progress=False) for size in (700, 40, 1)]
@@ -487,8 +489,8 @@ def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
 
 @pytest.mark.parametrize("options", OPTIONS)
 def test_many_instances_are_cut_as_each_alone(options):
-    """Of many instances of a bundle those clusters are not asked that a distance rules
-    out."""
+    """For many instances of a bundle, clusters are skipped that the distance
+    excludes."""
     scene, camera = lane_scene(200)
     for tolerance in (0.1, 3.0, 100.0):
         whole = select(scene, camera, tolerance=tolerance, device="cpu", **options)

@@ -1,4 +1,4 @@
-"""Starts of coarser clusters: pruning and merging."""
+"""The gaussians at which the fits of coarser clusters start: pruning and merging."""
 
 import itertools
 
@@ -39,7 +39,8 @@ def same(a, b):
 
 
 def transparent(gaussians):
-    """So that no merged opacity reaches 1, where area times opacity would be lost."""
+    """Return gaussians so transparent that no merged opacity reaches 1, where area
+    times opacity would be lost."""
     return scenes.replaced(gaussians, opacities=gaussians.opacities * np.float32(0.05))
 
 
@@ -68,7 +69,7 @@ def test_each_octant_keeps_its_share(device):
     corners = np.array(list(itertools.product([-1, 1], repeat=3)), np.float32)
     rng = np.random.default_rng(0)
     means = np.repeat(corners, 16, axis=0) + rng.uniform(-0.1, 0.1, (128, 3))
-    # One corner has all that matters, and still no more than its share survives.
+    # All visible gaussians are in one corner, of which no more than its share survives.
     opacities = np.where(np.arange(128) < 16, 0.9, 0.01)
     kept = prune(device, scenes.gaussians(means, opacities=opacities), [128], [64])
     corner = np.round(kept.means).astype(int)
@@ -82,7 +83,7 @@ def test_each_octant_keeps_its_share(device):
 def test_merging_all_agrees_with_reference(device, seed, num, degree):
     g = random_gaussians(seed, num, sh_degree=degree)
     one, expected = merge(device, g, [num], [1]), reference.merged(g)
-    if num == 2:  # more are merged pair by pair, each with an opacity of at most 1
+    if num == 2:  # if more survive, pairs are merged, each with an opacity of at most 1
         assert_close(one.opacities[0], expected.opacity, MERGE_FLOAT)
     assert_close(one.means[0], expected.mean, MERGE_FLOAT)
     size = np.trace(expected.covariance)
@@ -107,7 +108,8 @@ def test_cheapest_pair_is_merged(device, seed, count):
     g = random_gaussians(seed, count)
     out = merge(device, g, [count], [count - 1])
     i, k = reference.cheapest_pair(g)
-    # The rest stays as it is, in order, the pair at the place of its first member.
+    # The others stay unchanged and in order, and the pair takes the place of its first
+    # member.
     rest = np.delete(np.arange(count), [i, k])
     assert same(out.subset(np.delete(np.arange(count - 1), i)), g.subset(rest))
     assert_close(out.means[i], reference.merged(g.subset(np.array([i, k]))).mean, MERGE_FLOAT)
@@ -126,7 +128,7 @@ def test_equal_gaussians_merge_into_their_like(device):
     assert_close(one.means, g.means, MERGE_FLOAT)
     assert_close(np.sort(one.scales), np.sort(g.scales), MERGE_FLOAT)
     assert_close(one.opacities, 8 * g.opacities, MERGE_FLOAT)
-    # Ties by index: the first two pair up.
+    # Ties are decided by index, so the first two are paired.
     assert same(
         merge(device, copies, [8], [7]).subset(slice(1, None)), copies.subset(slice(2, None))
     )
@@ -148,7 +150,7 @@ SHAPES = {
 )
 @pytest.mark.parametrize("shape", SHAPES)
 def test_scales_and_rotation_make_up_the_covariance(device, shape, quat):
-    """The eigenvalues that equal, vanish or differ by millions."""
+    """Eigenvalues may be equal, zero, or differ by factors of millions."""
     scales = np.array(SHAPES[shape])
     g = scenes.gaussians([[0, 0, 0], scales[0] * 0.5], quats=quat, scales=scales, opacities=0.1)
     one, expected = merge(device, g, [2], [1]), reference.merged(g)
@@ -175,7 +177,8 @@ def test_opaque_gaussians_stay_opaque(device):
 
 
 def test_area_is_that_of_the_ellipsoid():
-    """Against its shadow, averaged over all directions: the surface over 4 pi."""
+    """The area is compared with the mean area of the shadow over all directions, which
+    is the surface area divided by 4 pi."""
     z, weight = np.polynomial.legendre.leggauss(256)
     turn = 2 * np.pi * (np.arange(256) + 0.5) / 256
     x, y = (np.sqrt(1 - z * z)[:, None] * f(turn) for f in (np.cos, np.sin))

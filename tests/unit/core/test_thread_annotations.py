@@ -1,4 +1,4 @@
-"""Clang proves that what a mutex guards is used while the mutex is held.
+"""Clang proves that guarded fields are used only while their mutex is held.
 
 `.ci/check_threads.py` runs it, and here it is also given copies of the sources in which
 one lock is gone: it has to notice each.
@@ -58,7 +58,7 @@ def test_headers_that_no_source_includes_are_checked_alone():
     assert "base/ahead.h" in check("--list").stdout.split()
 
 
-# base/mutex.h wraps the standard library's types. A child of fork() constructs the
+# base/mutex.h wraps the types of the standard library. A child of fork() constructs the
 # mutex of the other file again.
 UNCHECKED = {"base/mutex.h", "bindings/python_lock.cpp"}
 
@@ -70,7 +70,8 @@ def test_clang_knows_every_mutex():
     assert {str(path.relative_to(CSRC)) for path in users} == UNCHECKED
 
 
-# What is removed, from where, which source is checked then, and what clang says.
+# The text that is removed, the file with it, the source that is then checked, and the
+# warning of clang.
 BROKEN = {
     "a caller that does not lock": (
         "residency/page_pool.cpp",

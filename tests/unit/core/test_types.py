@@ -1,5 +1,5 @@
-"""Values that cross into the compiled module: each refuses what it cannot be, and names
-it."""
+"""Values that are passed to the compiled module. Each refuses wrong values and names
+them."""
 
 import re
 
@@ -109,7 +109,7 @@ def test_windows_outside_of_the_picture_are_refused(window):
 
 
 def test_window_leaves_the_camera_as_it_was():
-    """Also of a window another one may be made, anywhere in the picture."""
+    """A window of a window can be made, too, anywhere in the picture."""
     camera = _core.Camera(**CAMERA)
     part = camera.window(10, 10, 20, 20)
     assert part is not camera
@@ -209,7 +209,7 @@ def test_rows_say_what_they_are():
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_rows_of_mixed_types_are_refused(name):
-    other = {"means": "quats"}.get(name, name)  # the first that is not like the means
+    other = {"means": "quats"}.get(name, name)  # the first that does not match the means
     for dtype, wrong in ((np.float32, np.float64), (np.float64, np.float32)):
         expected, got = (dtype, wrong) if name != "means" else (wrong, dtype)
         message = f"{other}: expected dtype {np.dtype(expected)}, got {np.dtype(got)}"
@@ -258,7 +258,7 @@ def test_rows_keep_what_they_borrow():
 
 
 def test_operations_on_doubles_are_refused():
-    """All but the rasterizer compute in float32."""
+    """All operations except the rasterizer compute in float32."""
     offset = np.array([0, 4])
     for operation in (
         lambda g: _core.bound_by_boxes(g, offset),
@@ -302,8 +302,8 @@ def test_other_values_are_refused():
 
 
 def test_frame_refuses_a_scene_of_other_bundles():
-    """It may have the gaussians of bundles that the scene has not yet, but not of
-    others in their places."""
+    """A frame may have the gaussians of bundles that the scene does not have yet, but
+    not those of other bundles in their places."""
     bundles = [random_bundle(seed) for seed in (1, 2)]
     one, two = map(residency.table, bundles)
     for has, tables in (

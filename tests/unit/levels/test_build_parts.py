@@ -1,5 +1,5 @@
-"""Builds in parts: plans from counts, subtrees alone and in any order, files that take
-what is finished."""
+"""Builds in parts: plans from counts, subtrees that are built alone and in any order,
+and files that receive finished parts."""
 
 from dataclasses import asdict, fields, replace
 from functools import partial
@@ -46,13 +46,13 @@ def in_split_order(asset, config):
 
 
 def arrays_of(level):
-    """All of a level by name."""
+    """Return all arrays of a level by name."""
     rows = {name: getattr(level.gaussians, name) for name in scenes.NAMES}
     return rows | {field.name: getattr(level.tables, field.name) for field in fields(LevelTables)}
 
 
 def part_of(level, plan, part):
-    """What a level has of some of its groups."""
+    """Return the part of a level that belongs to some of its groups."""
     groups = slice(part.first_group, part.first_group + part.num_groups)
     made = plan.num_clusters // plan.num_groups
     clusters = slice(groups.start * made, groups.stop * made)
@@ -66,8 +66,8 @@ def part_of(level, plan, part):
 
 
 def build_subtree(leaves, plan, config, codec, level, first_group, last_group):
-    """The levels above the leaves under a run of groups, made from those leaves alone;
-    and their plan."""
+    """Return the levels above the leaves under a run of groups, built from these leaves
+    alone, and their plan."""
     part = plan.subtree(level, first_group, last_group)
     bottom = part.levels[0].first_group
     rows = plan.levels[0].offset[[bottom, bottom + part.levels[0].num_groups]]
@@ -76,7 +76,7 @@ def build_subtree(leaves, plan, config, codec, level, first_group, last_group):
 
 
 def joined(levels):
-    """One level of the parts of it, in order."""
+    """Return one level that consists of these parts, in order."""
     tables = (
         np.concatenate([getattr(level.tables, field.name) for level in levels])
         for field in fields(LevelTables)
@@ -136,7 +136,8 @@ def test_plan_of_a_subtree_is_a_part_of_the_plan():
     ("name", "codec"), [*((name, "float32") for name in CONFIGS), ("ours", "quantized")]
 )
 def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
-    """Whatever is built beside it, below which level, and in which order."""
+    """The subtree is the same whatever is built beside it, below any level, and in any
+    order."""
     config = CONFIGS[name]
     leaves, plan = in_split_order(asset, config), Plan.of(len(asset), config)
     codec = codec_of(codec, asset.sh_degree)
@@ -159,8 +160,8 @@ def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", ["ours", "groups_of_4"])
 def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
-    """Their pages go to the file as they are finished; what is above is built from what
-    they became."""
+    """The pages of a subtree are written when it is finished; the levels above are
+    built from the decoded pages."""
     config = CONFIGS[name]
     options = {"config": config, "seed": SEED, "progress": False, "device": "cpu", "codec": codec}
     build_bundle(asset, **options).write(tmp_path / "whole.v3dg")
@@ -202,7 +203,7 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", ["ours", "previous", "groups_of_4"])
 def test_units_are_the_same_on_any_number_of_threads(asset, name, codec, monkeypatch, tmp_path):
-    """And an interrupted build goes on to the same bytes, whichever units were
+    """An interrupted build continues to the same bytes, whichever units were
     finished."""
     config = CONFIGS[name]
     monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 160)
@@ -238,7 +239,7 @@ def test_units_hold_all_leaves_and_no_more_than_asked():
             units = plan.units(most)
             sizes = [part.levels[0].num_gaussians for part in units]
             assert sum(sizes) == count
-            assert max(sizes) <= max(most, 2 * 256)  # a page is not shared
+            assert max(sizes) <= max(most, 2 * 256)  # no page is shared
             assert len({len(part.levels) for part in units}) == 1
 
 
@@ -262,12 +263,13 @@ def test_a_file_is_built_as_a_bundle_is(asset, codec, tmp_path):
     parts = (opened.clusters, opened.groups, opened.gaussians, opened.config)
     v3dg.Bundle(*parts, other).write(tmp_path / "out.v3dg")
     again = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
-    assert again[1]  # what was converted since is not what was built
+    assert again[1]  # later conversions are not what was built
     assert (tmp_path / "out.v3dg").read_bytes() == (tmp_path / "memory.v3dg").read_bytes()
 
 
 def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
-    """Where it is not to be gone on with; what was left of another file stays."""
+    """The file is overwritten if the build does not continue; remains of another file
+    stay."""
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     left = [levels_path(tmp_path / f"{name}.v3dg") for name in "ab"]
     for path in left:
@@ -280,7 +282,8 @@ def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
 
 @pytest.mark.parametrize("mode", [None, 0o640])
 def test_a_built_file_has_the_permissions_of_a_written_one(asset, tmp_path, mode):
-    """Also behind a link, which stays one; until then, its owner alone may read it."""
+    """This also holds behind a link, which stays a link. Before the build ends, only
+    the owner can read the file."""
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     (tmp_path / "folder").mkdir()
     (tmp_path / "out.v3dg").symlink_to(tmp_path / "folder" / "target.v3dg")
@@ -299,8 +302,8 @@ def test_a_built_file_has_the_permissions_of_a_written_one(asset, tmp_path, mode
 
 def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatch):
     v3dg.write_asset(tmp_path / "asset.ply", asset)
-    # Whether an asset is smooth would be measured again, by fits that are not those of
-    # its levels.
+    # A part alone would measure again whether the asset is smooth, with fits that are
+    # not those of its levels.
     options = {"config": replace(SMALL, smooth="no"), "progress": False, "device": "cpu"}
 
     def interrupt(*_):
@@ -322,7 +325,7 @@ def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatc
 # ---- settings
 
 
-# Those of the build itself.
+# These are the settings of the build itself.
 OF_THE_BUILD = {
     *(
         "cluster_size",

@@ -47,7 +47,7 @@ def some_asset(n, sh_degree=0, seed=0):
 
 
 def broken(asset, rows):
-    """The same with gaussians among them that cannot be drawn."""
+    """Return the same gaussians, with some among them that cannot be drawn."""
     opacities = asset.opacities.copy()
     opacities[rows] = np.resize(np.float32([np.nan, 1e-4]), len(rows))
     return replace(asset, opacities=opacities)
@@ -66,7 +66,8 @@ def assert_same(got, expected):
 
 @pytest.fixture
 def small(monkeypatch):
-    """Few gaussians at a time, as if memory were much smaller than it has to be."""
+    """Read few gaussians at a time, as if memory were much smaller than the least that
+    is allowed."""
 
     def sizes(block=1 << 16, node=100, bucket=20):
         chosen = on_disk._Sizes(0, block, node, bucket)
@@ -238,7 +239,8 @@ def test_lower_degrees_get_zeros(tmp_path, small):
 
 
 def every_kind(folder, asset):
-    """Files of all kinds that can be written here, and of some that cannot."""
+    """Yield files of all kinds that can be written here, and some that cannot be
+    read."""
     paths = [
         folder / name for name in ("a.ply", "b.compressed.ply", "c.spz", "d.sog", "e.splat", "f.pt")
     ]
@@ -460,7 +462,8 @@ def test_scratch_in_use_and_files_of_others_are_kept(tmp_path, small):
     ):
         pass
     assert (tmp_path / "s" / "letter").read_text() == "dear"
-    (tmp_path / "s" / "letter").rename(tmp_path / "s" / "order")  # of a name that scratch has, too
+    # Scratch files have such a name, too.
+    (tmp_path / "s" / "letter").rename(tmp_path / "s" / "order")
     with (
         pytest.raises(
             ValueError, match="expected scratch files of a build, got another file, 'order'"
@@ -524,7 +527,7 @@ def test_peak_memory_is_what_was_given(tmp_path, suffix, sh_degree, mib, mib_for
         name, prepared, read = output.split()
         assert name == kind
         assert int(prepared) < memory
-        # A read takes what it returns, too.
+        # The memory of a read includes its result.
         assert int(read) < memory + 100_000 * gaussian_bytes(sh_degree)
 
 

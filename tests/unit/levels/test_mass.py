@@ -1,4 +1,4 @@
-"""Cuts keep the total alpha and colour of what is faint."""
+"""Cuts keep the total alpha and colour of faint assets."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ DISTANCE = 14.0
 
 @pytest.fixture(scope="module")
 def faint_cloud():
-    """3,000 faint gaussians around the origin."""
+    """Return 3,000 faint gaussians around the origin."""
     rng = np.random.default_rng(1)
     count = 3_000
     return v3dg.Gaussians(
@@ -26,7 +26,7 @@ def faint_cloud():
 
 
 def cameras(width):
-    """Views of the cloud from all sides, this many px wide."""
+    """Return views of the cloud from all sides, with this width in px."""
     rng = np.random.default_rng(2)
     for _ in range(24):
         eye = rng.normal(size=3)
@@ -37,14 +37,14 @@ def cameras(width):
 
 
 def totals(image):
-    """Sums of colour and alpha over a picture, (4,)."""
+    """Return the sums (4,) of colour and alpha over a picture."""
     planes = [host(image.color), host(image.alpha)[..., None]]
     return np.concatenate(planes, axis=-1).sum((0, 1), dtype=np.float64)
 
 
 def ratios(asset, bundle, width, device):
-    """Total colour and alpha of the cut at the default tolerance over those of the
-    asset at many samples a pixel, (4,)."""
+    """Return the total colour and alpha (4,) of the cut at the default tolerance,
+    divided by those of the asset at many samples per pixel."""
     of_cuts = np.zeros(4)
     of_asset = np.zeros(4)
     for camera in cameras(width):
@@ -60,7 +60,7 @@ def test_cuts_of_a_faint_asset_keep_its_alpha_and_colour(faint_cloud, device):
 
 
 def test_a_fit_by_pixels_alone_loses_alpha(faint_cloud):
-    """Medians of sparse pixels are below their means."""
+    """The medians of sparse pixels are below their means."""
     config = BuildConfig(loss_cells=0.0, smooth="no")
     bundle = v3dg.build_bundle(faint_cloud, config=config, device="cpu", progress=False)
     assert (ratios(faint_cloud, bundle, 14, "cpu") < 0.96).all()

@@ -1,4 +1,4 @@
-"""From where a refinement takes its pictures, without photographs."""
+"""The viewpoints of a refinement's pictures, which are found without photographs."""
 
 import functools
 

@@ -1,5 +1,5 @@
-"""Batches of cameras: the pictures, the decisions and the counts of each camera alone,
-environments, planes of the caller, and what is refused."""
+"""Batches of cameras: the pictures, decisions and counts equal those of each camera
+alone; environments, planes of the caller, and refused values."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def tinted_scene():
 
 
 def cameras_around(count, seed=0, width=WIDTH, height=HEIGHT):
-    """Near, far and inside, with lenses of their own."""
+    """Return cameras near, far and inside, each with its own intrinsics."""
     rng = np.random.default_rng(seed)
     cameras = []
     for _ in range(count):
@@ -126,7 +126,8 @@ def test_a_list_of_cameras_keeps_false_colors(scene, device, color_by):
 
 
 def test_many_random_cameras_choose_the_same(tinted_scene, device):
-    """Counts of selected gaussians agree for 64 x 90 random (camera, instance)."""
+    """The counts of selected gaussians agree for 64 x 90 random pairs of camera and
+    instance."""
     cameras = cameras_around(64, seed=6, width=16, height=16)
     renderer = v3dg.Renderer(tinted_scene, device=device)
     for fade in (None, 1.3):
@@ -205,7 +206,8 @@ def test_one_lens_may_serve_all_cameras(scene, device):
 
 
 def worlds(num_environments=5, seed=11):
-    """A scene with shared instances and some in environments, one of them empty."""
+    """Return a scene with shared instances and with environments, one of which is
+    empty."""
     rng = np.random.default_rng(seed)
     bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 300), 32)
     scene = Scene()
@@ -222,7 +224,8 @@ def worlds(num_environments=5, seed=11):
 
 
 def part_of(scene, environment):
-    """The instances that a camera of an environment sees, the shared ones first."""
+    """Return the instances that a camera of an environment sees, first the shared
+    ones."""
     shared = np.flatnonzero(scene.environments == -1)
     own = np.flatnonzero((scene.environments == environment) & (environment >= 0))
     rows = np.concatenate([shared, own])
@@ -369,7 +372,7 @@ def test_pictures_of_a_batch_are_indexed(scene, device):
 
 
 def tensors_of(cameras, **options):
-    """The cameras as tensors on the device."""
+    """Return the cameras as tensors on the device."""
     import torch
 
     arrays = CameraBatch.of(cameras)
@@ -438,7 +441,7 @@ def test_a_graph_draws_what_its_tensors_contain(scene, options):
         batch.viewmats.copy_(torch.tensor(np.stack([camera.viewmat for camera in others])))
         batch.K.copy_(torch.tensor(np.stack([camera.K for camera in others])))
 
-    for seed in (18, 19, 17):  # the buffers grow to what each needs
+    for seed in (18, 19, 17):  # the buffers grow to the needed sizes
         see(cameras_around(6, seed=seed))
         renderer.render_batch(batch, out=planes, **options).wait()
     graph = torch.cuda.CUDAGraph()
@@ -457,7 +460,8 @@ def test_a_graph_draws_what_its_tensors_contain(scene, options):
 
 @pytest.mark.gpu
 def test_a_batch_waits_for_nothing(scene):
-    """Nothing is copied to the host: a sleeping kernel before does not hold it up."""
+    """A batch copies nothing to the host, so a kernel that sleeps before it does not
+    delay the call."""
     import torch
 
     batch = tensors_of(cameras_around(6, seed=20))
@@ -501,7 +505,7 @@ def test_buffers_grow_for_callers_that_ignore_results(scene):
     renderer = v3dg.Renderer(scene, device="cuda")
     renderer.render_batch([far] * 24)
     planes = BatchPlanes(torch.zeros(24, HEIGHT, WIDTH, 3, device="cuda"))
-    for _ in range(4):  # items and gaussians are counted first, then entries, then long lists
+    for _ in range(4):  # first items and gaussians are counted, then entries, then long lists
         renderer.render_batch([near] * 24, tolerance=0.0, out=planes)
         torch.cuda.synchronize()
     alone = v3dg.render(scene, near, tolerance=0.0, device="cuda")

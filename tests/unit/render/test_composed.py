@@ -1,5 +1,5 @@
-"""Composed scenes: instances that come, go and move, budgets, cuts that are kept, false
-colours."""
+"""Composed scenes: instances are added, removed and moved; budgets, cuts that are drawn
+later, and false colours."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ from reference import select as reference
 from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import Scene, select
 
-# Of the tolerances that a budget chooses from, neighbours differ by this in their
-# float32 bits.
+# Neighbours among the tolerances from which a budget chooses differ by this number in
+# the bits of float32.
 STEP_BITS = 1 << 12
 
 
@@ -27,14 +27,15 @@ def same_picture(a, b):
 
 
 def step_from(tolerance, steps):
-    """The tolerance so many steps coarser."""
+    """Return a tolerance that is coarser by this number of steps."""
     return float(
         (np.float32(tolerance).view(np.int32) + np.int32(steps * STEP_BITS)).view(np.float32)
     )
 
 
 def composed(rng, count=40, **change):
-    """Instances of a laid-out bundle and of random trees, some important."""
+    """Return instances of a bundle with the layout of a build and of random trees, some
+    of them important."""
     scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 8), count, spread=8, **change)
     scene.add(random_bundle(int(rng.integers(1 << 30)), num_levels=4), rng.normal(size=(3, 3)))
     scene.set_importance(np.exp(rng.normal(size=len(scene))))
@@ -149,7 +150,7 @@ def test_nothing_finer_than_the_least_level(device, min_level):
 
 
 def rebuilt(scene):
-    """A new scene with the same instances, added run by run."""
+    """Return a new scene with the same instances, which are added run by run."""
     fresh = Scene()
     for i in range(len(scene)):
         fresh.add(
@@ -309,7 +310,7 @@ def test_cut_can_be_kept_while_the_camera_moves(device):
     kept = render(scene, other, cut=everything, device=device)
     assert kept.stats.gaussians_selected == everything.num_gaussians
     assert kept.stats.tolerance == 0.5
-    # Drawn as an asset is, from the same gaussians in the world.
+    # The asset is drawn from the same gaussians in the world.
     own = render(scene, other, tolerance=0.5, device=device)
     assert not np.array_equal(host(kept.color), host(own.color))
     nothing = select(
@@ -352,8 +353,8 @@ def test_both_devices_choose_the_same():
 
 @pytest.mark.gpu
 def test_budgets_before_do_not_matter():
-    # Few clusters, many of them at the edge of the picture: a coarser cut can have more
-    # gaussians.
+    # There are few clusters, many of them at the borders of the picture, so a coarser
+    # cut can have more gaussians.
     rng = np.random.default_rng(19)
     for _ in range(20):
         scene = random_scene(rng, lod_bundle(rng, blob(rng, 120), 8), 3, spread=1)
@@ -373,7 +374,7 @@ def test_picture_under_way_shows_the_scene_as_it_was():
     rng = np.random.default_rng(16)
     scene, camera = composed(rng), random_camera(rng, distance=8)
     renderer = Renderer(scene)
-    before = renderer.render(camera, tolerance=0.0)  # whose buffers are too small at first
+    before = renderer.render(camera, tolerance=0.0)  # its buffers are too small at first
     expected = Renderer(rebuilt(scene)).render(camera, tolerance=0.0)
     scene.move(positions=scene.positions + 1)
     after = renderer.render(camera, tolerance=0.0)

@@ -1,5 +1,5 @@
-"""Fades between levels: weights that add up to one, what they do to opacities, and that
-nothing jumps."""
+"""Fades between levels: weights add up to one and scale opacities, and no picture
+changes suddenly."""
 
 from dataclasses import replace
 
@@ -51,7 +51,8 @@ def same(a, b):
 
 
 def weights_of(selection, i, bundle):
-    """(C,) weights of the clusters of one instance, 0 where they are not drawn."""
+    """Return the weights (C,) of the clusters of one instance, 0 for clusters that are
+    not drawn."""
     weights, mine = np.zeros(len(bundle.clusters)), selection.instance_ids == i
     weights[selection.cluster_ids[mine]] = selection.weights[mine]
     return weights
@@ -92,7 +93,7 @@ def test_weights_are_those_of_the_ramp(seed, fade, min_level):
         low, high = tolerance / fade, tolerance * fade
         ramp = (np.clip(metric.astype(np.float64), low, high) - low) / (high - low)
         ramp = np.where(bundle.groups.level <= min_level, 0, ramp)
-        expected = np.append(ramp, 1.0)[parent] - np.append(ramp, 0.0)[own]  # -1 is no group
+        expected = np.append(ramp, 1.0)[parent] - np.append(ramp, 0.0)[own]  # -1 means no group
         np.testing.assert_allclose(weights_of(selection, i, bundle), expected, atol=2 / WHOLE)
 
 
@@ -139,8 +140,8 @@ def test_weights_follow_the_camera_without_a_jump():
                 changed + (weights != last).any(),
             )
         last = weights
-    # The metric grows by two steps, and by more near a ball, of a band that is 2 (fade
-    # - 1) wide.
+    # The metric grows by two steps, or more near a ball, in a band whose width is 2
+    # (fade - 1).
     assert changed > 100
     assert most < 3 * step / (fade - 1)
 
@@ -180,15 +181,16 @@ def test_budget_is_kept_in_steps(seed, fade, share):
 
 
 def slow_orbit(num_frames):
-    """Cameras that come to where CAMERA is, while clusters come into view and go."""
+    """Return cameras that move towards CAMERA, while clusters enter and leave the
+    view."""
     angles = 2e-3 * np.arange(num_frames)[::-1]
     eyes = [(6 * np.sin(a), -6 * np.cos(a), 1) for a in angles]
     return [Camera.look_at(eye, (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117) for eye in eyes]
 
 
 def settled_at(renderer, camera, options):
-    """The tolerance at which ten pictures of a camera at rest are the same, bit by
-    bit."""
+    """Return the tolerance at which ten pictures of a camera at rest are the same
+    bits."""
     first, *others = (renderer.render(camera, **options) for _ in range(10))
     for image in others:
         assert_same_bytes(image, first)
@@ -199,8 +201,8 @@ def settled_at(renderer, camera, options):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("memory", [None, "64MB"])
 def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, memory):
-    """From the first one on where it looks first; where slow motion ended, it goes to
-    the same in steps."""
+    """From the first picture on if the view is new; after slow motion, the budget
+    reaches the same picture in steps."""
     scene = composed_scene(np.random.default_rng(5))
     options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
     last = cameras[-1]
@@ -218,14 +220,14 @@ def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, me
         ways.append(np.log2(roomy / renderer.render(last, **options).stats.tolerance))
     steps = -np.diff(ways)
     assert ways[0] > 0.04
-    # Values of an octave are evenly apart.
+    # The values of an octave have equal distances.
     assert 0 <= steps.min() <= steps.max() < 2.1 * ways[0] / 8
     assert settled_at(renderer, last, options) == roomy
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_what_moves_is_not_at_rest(device):
-    """Also where it is an instance, or one of two cameras."""
+    """This also holds if an instance moves, or one of two cameras."""
     scene = composed_scene(np.random.default_rng(5))
     options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
     for what in ("an instance", "a camera", "nothing"):
@@ -264,8 +266,8 @@ def test_in_slow_motion_the_tolerance_of_a_budget_goes_in_steps(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_leaps_of_a_budget_are_made_at_once(device):
-    """After another view, another budget or another tolerance, and where the budget
-    binds no more."""
+    """This happens for another view, another budget or another tolerance, and if the
+    budget no longer limits the cut."""
     scene = composed_scene(np.random.default_rng(5))
     renderer = Renderer(scene, device=device)
     not_binding = {"budget": 9000, "tolerance": 5000.7}
@@ -290,7 +292,7 @@ def test_without_a_fade_a_budget_depends_on_the_view_alone():
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_cuts_that_follow_each_other_are_those_of_a_renderer(device):
-    """Also those of two viewers by turns."""
+    """This also holds for the cuts of two viewers by turns."""
     scene, where = composed_scene(np.random.default_rng(5)), _device.resolve(device)
     options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
     viewers = [(Renderer(scene, device=device), _core.BudgetSteps()) for _ in range(2)]
@@ -334,7 +336,8 @@ def test_turning_in_place_changes_no_weight(device):
 
 
 def faded(bundle, opacities, weights, device):
-    """Opacities after the weights of clusters of one gaussian each."""
+    """Return the opacities multiplied by the weights of clusters with one gaussian
+    each."""
     count = len(opacities)
     cut = Selection(
         Scene.of(bundle),
@@ -349,8 +352,8 @@ def faded(bundle, opacities, weights, device):
 
 
 def singles(opacities):
-    """A bundle of as many clusters of a gaussian each, side by side, all of them
-    leaves."""
+    """Return a bundle of this number of leaf clusters side by side, with one gaussian
+    each."""
     count = len(opacities)
     means = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], 1).astype(np.float32)
     asset = Gaussians(
@@ -374,7 +377,7 @@ def test_gaussians_have_opacities_times_weights(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_picture_is_that_of_the_gaussians_with_faded_opacities(device):
-    """Each with its filter: any rasterizer fades."""
+    """Each gaussian has the filter of its level, so any rasterizer can draw fades."""
     rng = np.random.default_rng(7)
     bundle = lod_bundle(rng, blob(rng, 900), 32, filter_px2=0.05)
     tolerance = float(np.median(group_metrics(bundle, CAMERA)[0]))
@@ -397,11 +400,12 @@ def test_picture_is_that_of_the_gaussians_with_faded_opacities(device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("filter_px2", "is_antialiased"), [(0.0, 0), (0.3, 0), (0.02, 1)])
 def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased, device):
-    """Also where nothing is on its way, so that a picture does not change as a whole
-    once something is."""
+    """Level 0 also has the filter while nothing fades, so that the picture does not
+    change as a whole when a fade begins."""
     rng = np.random.default_rng(3)
     asset = blob(rng, 900)
-    # Of a unit, about; none so narrow that it gets less.
+    # The gaussians are about a unit large; none is so narrow that it gets a smaller
+    # filter.
     px = CAMERA.fx / np.linalg.norm(CAMERA.position)
     asset = replace(asset, scales=np.clip(asset.scales, 0.2 / px, 0.5 / px).astype(np.float32))
     bundle = lod_bundle(rng, asset, 32)
@@ -438,8 +442,8 @@ def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased,
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("distance", [3, 10, 30, 60])
 def test_a_surface_of_tiny_gaussians_does_not_become_transparent(distance, device):
-    """Far smaller than the low-pass, so that each alone would be less than the least
-    alpha that is drawn."""
+    """The gaussians are far smaller than the filter, so that each alone would have less
+    than the least alpha that is drawn."""
     rng = np.random.default_rng(1)
     means = rng.normal(size=(50_000, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -462,8 +466,8 @@ def test_a_surface_of_tiny_gaussians_does_not_become_transparent(distance, devic
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_levels_that_are_drawn_alike_without_a_fade_are_not_with_one(device):
-    """The last clusters of level 0 and the first of level 1 follow each other, each
-    with its own filter."""
+    """The last clusters of level 0 and the first of level 1 are drawn one after the
+    other, each with its own filter."""
     rng = np.random.default_rng(5)
     bundle = lod_bundle(rng, blob(rng, 240, size=0.02), 60, filter_px2=0.0)
     clusters = replace(bundle.clusters, antialiased=np.ones_like(bundle.clusters.antialiased))

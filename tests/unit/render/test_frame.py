@@ -1,5 +1,5 @@
-"""Frames drawn by CUDA: the CPU's pictures, whatever the stream, the buffers and what
-was drawn before."""
+"""Frames on CUDA equal the pictures of the CPU, whatever the stream, the buffers and
+the frames before."""
 
 from dataclasses import replace
 
@@ -29,8 +29,8 @@ def test_scene_looks_as_on_the_cpu(sh_degree, tolerance):
 @pytest.mark.parametrize("sh_degree", [0, 3])
 @pytest.mark.parametrize("tops", [5, 20, 150])
 def test_neighbours_that_share_a_cluster_look_as_on_the_cpu(sh_degree, tops):
-    """Instances so far that their top clusters are drawn: alone, several at once, of
-    two bundles in turn."""
+    """The instances are so far that their coarsest clusters are drawn: alone, several
+    at once, and of two bundles by turns."""
     rng = np.random.default_rng(tops)
     bundles = [
         scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), tops, past_root=0)
@@ -62,7 +62,8 @@ def test_asset_looks_as_on_the_cpu(sh_degree):
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 3.0, 100.0])
 def test_gaussians_of_any_size(scale):
-    """From those that miss every pixel centre to those that cover every tile."""
+    """The sizes range from gaussians that miss every pixel centre to gaussians that
+    cover every tile."""
     rng = np.random.default_rng(1)
     blob = scenes_lod.blob(rng, 600)
     scales = (scale * np.exp(0.3 * rng.normal(size=(600, 3)))).astype(np.float32)
@@ -72,7 +73,7 @@ def test_gaussians_of_any_size(scale):
 
 @pytest.mark.parametrize("size", [(2100, 1500), (6000, 16)])
 def test_gaussians_over_thousands_of_tiles(size):
-    """Of those a few neighbours have more tiles than are listed together."""
+    """A few neighbouring gaussians cover more tiles than are listed together."""
     rng = np.random.default_rng(4)
     width, height = size
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=width, height=height)
@@ -91,15 +92,15 @@ def test_gaussians_over_thousands_of_tiles(size):
 )
 @pytest.mark.parametrize("count", [3000, 60_000])
 def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
-    """Where few tiles have most of the entries; a frame that keeps a tape blends tiles
-    whole."""
+    """Few tiles have most of the entries. A frame that keeps a tape does not blend
+    tiles in parts."""
     rng = np.random.default_rng(count)
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=640, height=400)
     ranges = {"spread": (2, 3), "one before all": (4, 4.1), "on sheets": (2, 2.0001)}
     depth = rng.uniform(*ranges.get(depths, (2, 2)), count)
     if depths == "one before all":
         depth[0] = 0.02
-    if depths == "in one step":  # of the depths that lists are sorted by
+    if depths == "in one step":  # of the depths by which lists are sorted
         depth = np.where(rng.random(count) < 0.5, depth, np.nextafter(np.float32(2), np.float32(3)))
     if depths == "on sheets":
         depth += rng.integers(0, 7, count) ** 2
@@ -119,8 +120,8 @@ def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
 
 @pytest.mark.parametrize("millions", [70, 140])
 def test_frames_with_room_for_many_records_have_the_same_bytes(millions):
-    """Depth has fewer bits in the lists of such frames; many here are alike, or one
-    float apart."""
+    """Lists of such frames have fewer bits for the depth. Many depths here are equal,
+    or differ by one float."""
     rng = np.random.default_rng(millions)
     blob = scenes_lod.blob(rng, 20_000, size=0.5)
     faint = replace(blob, opacities=np.full(len(blob), 0.003, np.float32))  # too faint for a record
@@ -141,7 +142,7 @@ def test_poisoned_gaussians_are_left_out():
     for i, name in enumerate(scenes.NAMES):
         for k, value in enumerate((np.nan, np.inf, -np.inf, 0.0, 1e30)):
             poisoned[name][40 * i + k] = value
-    poisoned["sh"][:] = asset.sh  # a colour that is no number is one on both devices
+    poisoned["sh"][:] = asset.sh  # a NaN colour is NaN on both devices
     subject = Gaussians(**poisoned)
     assert_like_cpu(render(subject, CAMERA, device="cuda"), render(subject, CAMERA, device="cpu"))
 
@@ -157,8 +158,8 @@ def test_nothing_gives_the_background(subject):
 
 
 def test_buffers_that_were_too_small_leave_no_trace():
-    """The first frame of a renderer finds next to no room; later ones what it
-    needed."""
+    """The first frame of a renderer has hardly any memory; later frames have as much as
+    the frames before needed."""
     subject = composed_scene(np.random.default_rng(3))
     renderer = Renderer(subject)
     first, second = (renderer.render(CAMERA, tolerance=0.0) for _ in range(2))
@@ -236,7 +237,7 @@ def test_a_graph_draws_again(options):
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         image = renderer.render(CAMERA, **options)
-    # Other pictures, which need other buffers, in between.
+    # Other pictures are drawn in between, which need other buffers.
     other = renderer.render(CAMERA.scaled(4), tolerance=0.0)
     other.stats  # noqa: B018  waits
     for _ in range(3):
@@ -256,7 +257,7 @@ def test_a_graph_of_what_was_not_drawn_before_is_refused():
 
     def assert_refused():
         with torch.cuda.graph(torch.cuda.CUDAGraph()):
-            torch.zeros(1, device="cuda")  # for torch warns of graphs without work
+            torch.zeros(1, device="cuda")  # because torch warns of empty graphs
             with pytest.raises(RuntimeError, match=r"draw .* once before the capture"):
                 renderer.render(CAMERA)
 

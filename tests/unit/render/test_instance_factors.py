@@ -1,4 +1,5 @@
-"""Opacity and tint of instances: in pictures, in cuts, in exports, on every device."""
+"""The opacity and the tint of instances: in pictures, in cuts and in exports, on every
+device."""
 
 import numpy as np
 import pytest
@@ -18,14 +19,14 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 def bundle_of(seed, count=300, sh_degree=1, codec="float32"):
-    """A bundle, and what it holds as gaussians of level 0."""
+    """Return a bundle, and its gaussians of level 0."""
     rng = np.random.default_rng(seed)
     bundle = lod_bundle(rng, blob(rng, count, sh_degree=sh_degree), 32)
     return v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, {}, codec)
 
 
 def tinted(gaussians, tint, opacity):
-    """The definition: the clamped colour is multiplied, and the opacity is."""
+    """By definition, the clamped colour and the opacity are multiplied."""
     factor = np.asarray(tint, np.float64)
     sh = gaussians.sh.astype(np.float64) * factor
     sh[:, 0] += (factor - 1) * 0.5 / 0.28209479177387814
@@ -122,8 +123,8 @@ def test_a_given_cut_skips_what_has_become_invisible(device):
 
 
 def crowd(rng, count=90):
-    """Instances of two bundles with factors of their own, near and far: coarse clusters
-    are shared by neighbours."""
+    """Return instances of two bundles, each with its own factors, near and far;
+    neighbours share coarse clusters."""
     scene = Scene()
     for seed, sh_degree in ((0, 0), (1, 2)):
         scene.add(

@@ -27,7 +27,7 @@ def test_depth_is_drawn_where_it_is_asked_for(device):
 
 
 def test_asset_and_bundle_are_seen_from_the_same_place(device):
-    """Also with a rotation that is off by what float32 text loses, far from the
+    """The rotation has an error as in float32 text, and the camera is far from the
     origin."""
     rng = np.random.default_rng(20)
     center = np.array([300.0, -200.0, 50.0])
@@ -38,8 +38,8 @@ def test_asset_and_bundle_are_seen_from_the_same_place(device):
     viewmat[:3, :3] += rng.uniform(-3e-5, 3e-5, (3, 3))
     viewmat[:3, 3] = -viewmat[:3, :3] @ exact.position
     camera = v3dg.Camera(viewmat, exact.K, 64, 48)
-    # Where the rotation is taken for one, the eye is elsewhere, and colours change with
-    # the direction.
+    # If this matrix were used as an exact rotation, the eye would be elsewhere, and
+    # colours would depend on the wrong direction.
     np.testing.assert_allclose(camera.position, exact.position, atol=1e-9)
     assert np.linalg.norm(-viewmat[:3, :3].T @ viewmat[:3, 3] - camera.position) > 5e-3
     as_bundle = render(bundle, camera, tolerance=0.0, depth=True, device=device)
@@ -50,6 +50,6 @@ def test_asset_and_bundle_are_seen_from_the_same_place(device):
         for name in ("color", "alpha", "depth"):
             error = np.abs(host(getattr(picture, name)) - host(getattr(as_bundle, name)))
             assert error.max() < 2e-4, name
-            # Depths are of 6, where float32 has steps of 5e-7; what is packed is
+            # Depths are near 6, where the steps of float32 are 5e-7; packed values are
             # rounded once more.
             assert error.mean() < 3e-6, name

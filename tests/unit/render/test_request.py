@@ -1,4 +1,4 @@
-"""What is asked for, as it goes to the core: cuts, and what pixels show."""
+"""Requests as they are passed to the core: cuts, and the content of pixels."""
 
 import itertools
 
@@ -59,7 +59,8 @@ TOLERANCES = [0.0, 3.0, 5.0, 9.4, 20.0]
 
 @pytest.fixture(scope="module")
 def asset():
-    """Gaussians that leave less than a ten-thousandth of the light in most pixels."""
+    """Return gaussians that leave less than a ten-thousandth of the light in most
+    pixels."""
     return random_gaussians(np.random.default_rng(5), 2000)
 
 
@@ -87,7 +88,8 @@ def test_the_stop_grows_with_the_tolerance_of_the_cut():
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_pixels_of_cuts_stop_by_their_tolerance(bundle, device, tolerance):
-    """Also of both eyes, of a cut that was selected before, and with a pool."""
+    """This also holds for both eyes, for a cut that was selected before, and with a
+    pool."""
     stop = _core.stop_of_tolerance(tolerance)
     options = {"tolerance": tolerance, "device": device}
     expected = v3dg.render(bundle, EYE, min_transmittance=stop, **options)
@@ -115,7 +117,7 @@ def test_pixels_of_a_budget_stop_by_the_tolerance_that_meets_it(bundle, device, 
 
 
 def test_a_cut_of_level_0_is_no_worse_than_its_asset(asset, bundle, device):
-    """At the default tolerance, from near by, where all of it is level 0."""
+    """The default tolerance is used near the asset, where the whole cut is level 0."""
     near = Camera.look_at((0, -1.5, 0), (0, 0, 0), width=480, height=400)
     truth = v3dg.rasterize(asset, near)
     picture = v3dg.render(bundle, near, device=device)

@@ -1,5 +1,5 @@
-"""Two eyes that share one cut: it is exact for the nearer one, and leaves out what
-neither may see."""
+"""Two eyes share one cut. It is exact for the nearer eye, and leaves out what neither
+can see."""
 
 import dataclasses
 import pickle
@@ -30,8 +30,8 @@ def scene():
 
 
 def stereo_cameras(count=20, seed=1):
-    """Near and far, with eyes close together and far apart, of different fields of view
-    and sizes."""
+    """Return cameras near and far, with small and large eye distances, and different
+    fields of view and sizes."""
     rng = np.random.default_rng(seed)
     for _ in range(count):
         eye = rng.normal(size=3) * rng.choice([1.0, 6.0, 20.0])
@@ -58,12 +58,12 @@ def options_of(k, scene, stereo):
 
 
 def test_the_cut_is_that_of_the_nearer_eye(scene):
-    """Refined where either eye alone refines; each eye's cut is at least as coarse on
-    every path."""
+    """The cut is refined if one of the eyes alone refines it; the cut of each eye is at
+    least as coarse on every path."""
     groups_of = [bundle.clusters for bundle in scene.bundles]
     for stereo in stereo_cameras():
         if stereo.left.fx != stereo.right.fx:
-            continue  # the larger pixels of one would be taken for those of both
+            continue  # otherwise the larger pixels of one eye would be used for both
         level = {"tolerance": 3.0, "cull": False, "device": "cpu"}
         both, left, right = (select(scene, camera, **level) for camera in (stereo, *stereo.eyes))
         for i in range(len(scene)):
@@ -73,7 +73,7 @@ def test_the_cut_is_that_of_the_nearer_eye(scene):
 
 
 def refined_groups(cut, i, clusters):
-    """The groups above what is chosen of an instance."""
+    """Return the groups above the chosen clusters of an instance."""
     parent_of_group = np.full(clusters.parent_group.max() + 1, -1)
     made = clusters.own_group >= 0
     parent_of_group[clusters.own_group[made]] = clusters.parent_group[made]

@@ -1,5 +1,5 @@
-"""Parts of a picture on the CPU: the same bits as in the whole, however many gaussians
-there are."""
+"""Windows of a picture on the CPU have the same bits as the whole picture, for any
+number of gaussians."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height
 
 
 def crowd(rng, count, num_gaussians=400):
-    """Many instances of one bundle around the origin."""
+    """Return many instances of one bundle around the origin."""
     bundle = scenes_lod.lod_bundle(
         rng, scenes_lod.blob(rng, num_gaussians, size=0.2, sh_degree=1), 64
     )
@@ -25,7 +25,7 @@ def crowd(rng, count, num_gaussians=400):
 
 
 def draw_window(scene, camera, window):
-    """Colour, alpha, depth and statistics of the pixels [x0, x1) x [y0, y1)."""
+    """Return colour, alpha, depth and statistics of the pixels [x0, x1) x [y0, y1)."""
     selection = select(scene, camera, tolerance=0.0, device="cpu")
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, scene.bundles, CPU, "appearance")
@@ -60,7 +60,8 @@ def test_window_has_the_bits_of_the_whole_picture():
 
 
 def test_picture_of_more_gaussians_than_memory_takes_at_once_is_the_same():
-    """Drawn in bands; its halves hold few enough to be drawn in one go."""
+    """The picture is drawn in bands; each half has few enough gaussians to be drawn at
+    once."""
     rng = np.random.default_rng(1)
     middle = CAMERA.height // 2
     halves = [(0, 0, CAMERA.width, middle), (0, middle, CAMERA.width, CAMERA.height)]

@@ -1,4 +1,4 @@
-"""The viewer without a browser; test_viewer_tab.py and test_viewer_browser.py open it
+"""The viewer without a browser. test_viewer_tab.py and test_viewer_browser.py open it
 in one."""
 
 import contextlib
@@ -21,7 +21,7 @@ from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View, look_at
 
 SIZE = (96, 64)
-SECONDS = 20  # that nothing here takes
+SECONDS = 20  # a time that nothing here needs
 
 
 # Views.
@@ -58,7 +58,7 @@ def test_view_shows_the_same_at_any_size():
 
 
 def stack(opacities):
-    """Round gaussians one behind the other, on the axis of `AXIS`."""
+    """Return round gaussians one behind the other on the axis of `AXIS`."""
     count = len(opacities)
     means = np.zeros((count, 3), np.float32)
     means[:, 1] = np.arange(count) * 0.01
@@ -94,7 +94,7 @@ def scene_view(crowd, device):
 
 
 def drawn(scene_view, view, device, **options):
-    """What `v3dg.render` draws there, and its figures."""
+    """Return the picture of `v3dg.render` and its statistics."""
     image = v3dg.render(
         scene_view.scene, view.camera(*SIZE, scene_view.near), device=device, **options
     )
@@ -165,8 +165,8 @@ def test_an_empty_picture_is_black_in_every_mode(scene_view):
     [([0.1] * 5, 5), ([0.1] * 40, 40), ([1.0, 0.999, 0.5, 0.5], 2), ([0.91] * 8, 4)],
 )
 def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
-    """At the default tolerance, gaussians behind the one that takes the transmittance
-    to 1e-4 or below are not blended."""
+    """At the default tolerance, gaussians behind the one that reduces the transmittance
+    to 1e-4 or less are not blended."""
     scene_view = SceneView(stack(opacities), device="cpu")
     camera = AXIS.camera(33, 33, 0.01)
     cut = v3dg.select(scene_view.scene, camera, device="cpu")
@@ -193,7 +193,7 @@ def test_count_is_shown_on_a_scale_of_octaves(device):
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
 def test_error_is_the_share_of_the_tolerance_that_is_used(share, device):
-    """Of each instance by itself, and none where the finest level is drawn."""
+    """Each instance has its own value; it has none where its finest level is drawn."""
     rng = np.random.default_rng(0)
     bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 600, size=0.3), 64)
     scene = Scene()
@@ -301,7 +301,7 @@ def test_a_stop_ends_a_long_picture_early():
     in_bands = scene_view.frame(view, (800, 600), settings, _core.Stop()).pixels
     np.testing.assert_array_equal(in_bands, undisturbed)
     shortest = whole
-    for part in range(4, 14):  # the machine may be busy, now or then
+    for part in range(4, 14):  # the machine may be busy at times
         stop = _core.Stop()
         timer = threading.Timer(whole / part, stop.request)
         start = time.monotonic()
@@ -317,7 +317,7 @@ def test_a_stop_ends_a_long_picture_early():
 
 
 def paced(milliseconds, full=(1920, 1080), pictures=60):
-    """Drafts that a pacer chooses where one takes that long."""
+    """Return the drafts that a pacer chooses if one takes this long."""
     pacer, drafts = Pacer(60.0), []
     for _ in range(pictures):
         drafts.append(pacer.draft(full))
@@ -381,14 +381,14 @@ def test_sizes_double_up_to_the_full_one():
 
 
 class FakeSceneView:
-    """Notes what is drawn; pictures of the widths in `hold` wait for a stop, up to a
+    """Records what is drawn. Pictures with widths in `hold` wait for a stop, up to a
     tolerance."""
 
     draws_all_while_moving, pool = False, None
 
     def __init__(self):
         self.drawn, self.hold, self.held_until = [], (), math.inf
-        self.tolerances, self.steps = iter(()), []  # that a budget comes to
+        self.tolerances, self.steps = iter(()), []  # the tolerance of the budget
         self.is_held = threading.Event()
 
     def frame(self, view, size, settings, stop, steps):
@@ -423,7 +423,8 @@ class NoPacer:
 
 @pytest.fixture
 def rendering(request):
-    """A render loop, what it draws of, and what it sent: (view, size, is it final)."""
+    """Return a render loop, its view, and what it sent: (view, size, whether the
+    picture is final)."""
     scene_view = FakeSceneView()
     sent = []
     errors = []
@@ -497,7 +498,7 @@ def test_a_larger_picture_that_is_late_is_not_sent(rendering):
 
     def frame(view, size, *rest):
         picture = draw(view, size, *rest)
-        if (view, size) == (1, (80, 40)):  # something new is asked for when it is nearly done
+        if (view, size) == (1, (80, 40)):  # a new picture is requested when it is nearly finished
             rendering.loop.ask(Request(2, (160, 80), Settings()))
         return picture
 
@@ -568,7 +569,7 @@ def test_a_draft_that_takes_too_long_is_given_up_for_a_newer_request(rendering):
     rendering.loop.ask(Request(1, (160, 80), Settings()))
     wait(rendering.scene_view.is_held)
     rendering.loop.ask(Request(2, (160, 80), Settings()))
-    assert len(rendering.scene_view.drawn) == 1  # it may take a little while
+    assert len(rendering.scene_view.drawn) == 1  # this may take a short time
     time.sleep(PATIENCE_SECONDS)
     rendering.loop.ask(Request(3, (160, 80), Settings()))
     wait(rendering.is_final)
@@ -585,7 +586,7 @@ def test_the_least_draft_is_finished_so_that_something_is_seen(rendering):
         time.sleep(PATIENCE_SECONDS / 4)
     widths = [size[0] for _, size, _ in rendering.scene_view.drawn]
     assert widths[-1] == round(160 / 4)
-    assert len(widths) < 12  # the last is not given up
+    assert len(widths) < 12  # the last picture is not abandoned
     rendering.scene_view.hold = ()
     wait(rendering.is_final)
     assert len(rendering.sent) > 1

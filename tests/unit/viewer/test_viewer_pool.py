@@ -1,5 +1,5 @@
-"""The viewer with a pool: pictures that become those of all as pages come in, and what
-it leaves out."""
+"""The viewer with a pool: its pictures become those of the whole scene while pages
+arrive; and what a viewer with a pool lacks."""
 
 import math
 import threading
@@ -102,7 +102,7 @@ def test_what_is_compared_frozen_and_measured_is_that_of_all(scene, settings):
     assert frame.figures.missing == 0
     assert frame.figures.tolerance == expected.figures.tolerance
     assert (frame.value_range, frame.distance) == (expected.value_range, expected.distance)
-    if settings.frozen is not None:  # which is of another camera
+    if settings.frozen is not None:  # of another camera
         free = pooled.frame(VIEW, SIZE, replace(settings, frozen=None), None, None, math.inf)
         assert (free.pixels != frame.pixels).any()
 
@@ -132,8 +132,8 @@ def test_a_pool_without_room_for_all_compares_with_the_finest_that_it_has_room_f
     assert frame.pixels.any()
     finest = Settings(shows="difference", tolerance=0.0, fade=None)
     frame = pooled.frame(VIEW, SIZE, finest, None, None, math.inf)
-    assert frame.figures.tolerance > 0  # there is no room for all
-    assert not frame.pixels.any()  # both are of the same tolerance
+    assert frame.figures.tolerance > 0  # there is not enough memory for all pages
+    assert not frame.pixels.any()  # both have the same tolerance
 
 
 def test_a_click_finds_what_is_resident(scene):
@@ -141,7 +141,7 @@ def test_a_click_finds_what_is_resident(scene):
     pooled = SceneView(scene, device="cpu", memory="64MB")
     settings = Settings(tolerance=0.5, fade=None)
     places = [(x, y) for x in range(4, SIZE[0], 16) for y in range(4, SIZE[1], 16)]
-    early = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]  # of the coarsest pages
+    early = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]  # the coarsest pages
     assert {pick.level for pick in early if pick is not None} == {pooled.num_levels - 1}
     pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
     bytes_in = pooled.pool.pool_frame.core.status().bytes_in
@@ -167,7 +167,7 @@ def test_picks_of_a_renderer_without_a_pool_are_refused(scene):
 
 
 def test_a_still_is_cut_once_and_a_settled_one_twice(scene, monkeypatch):
-    """Once to see that nothing is missing, and once to draw."""
+    """The first cut shows that no page is missing, and the second is drawn."""
     pooled, settings = SceneView(scene, device="cpu", memory="64MB"), Settings(tolerance=0.5)
     pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
     core, asks, selects = pooled.pool.pool_frame._pool, [], []
@@ -199,7 +199,8 @@ def test_a_still_is_cut_once_and_a_settled_one_twice(scene, monkeypatch):
 
 @pytest.fixture
 def loop(scene):
-    """A render loop over a pool, and what it sent: (frame, is it final, number)."""
+    """Return a render loop with a pool, and what it sent: (frame, whether it is final,
+    number)."""
     pooled = SceneView(scene, device="cpu", memory="64MB")
     sent = []
     is_done = threading.Event()
@@ -234,13 +235,13 @@ def test_pictures_follow_until_nothing_is_missing(scene, loop):
         assert frame.figures.missing == 0
         expected = SceneView(scene, device="cpu", memory=None).frame(view, SIZE, settings)
         np.testing.assert_array_equal(frame.pixels, expected.pixels)
-        time.sleep(0.3)  # in which nothing is left to draw
+        time.sleep(0.3)  # time in which nothing remains to be drawn
     assert [final for _, final, _ in loop.sent].count(True) == 2
     assert not loop.errors
 
 
 def test_pictures_are_sent_while_pages_come_in(loop, monkeypatch):
-    """One page at a time, on a disk that is slow."""
+    """One page arrives at a time, from a slow disk."""
     pool = loop._scene_view.pool.pool_frame
     real, calls = pool.settle, []
 

@@ -1,5 +1,5 @@
-"""The viewer's page: its types are those of the messages, and its modules keep their
-shape."""
+"""The viewer's page: its types agree with the messages, and its modules keep their
+structure."""
 
 import re
 import shutil
@@ -28,7 +28,7 @@ LOOK = {
 
 
 def test_types_of_the_page_are_those_of_the_messages():
-    """After a change of them: python tests/support/page_protocol.py."""
+    """After a change of the messages, run python tests/support/page_protocol.py."""
     assert page_protocol.FILE.read_text(encoding="utf-8") == page_protocol.protocol()
 
 
@@ -58,7 +58,8 @@ def test_limits_are_those_of_the_messages():
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda path: path.name)
 def test_modules_of_the_page_declare_their_fields(module):
-    """In the class or in its constructor, each by a statement of its own."""
+    """Fields are declared in the class or in its constructor, each with its own
+    statement."""
     text = module.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= MOST_LINES
     for name, body in re.findall(r"^(?:export )?class (\w+) \{\n(.*?)^\}", text, re.M | re.S):
@@ -70,7 +71,7 @@ def test_modules_of_the_page_declare_their_fields(module):
 
 
 def assigned(text):
-    """Names of the fields that code of a class assigns to."""
+    """Return the names of the fields to which the code of a class assigns."""
     return {*re.findall(r"\bthis\.(\w+) [-+*/]?= ", text)}
 
 

@@ -1,0 +1,104 @@
+#pragma once
+
+// What a sensor gives beside colour: further channels of a picture, and the picture of
+// meshes behind which gaussians are hidden. docs/sensors.md defines every channel.
+
+#include <cstddef>
+#include <cstdint>
+
+#include "base/host_device.h"
+
+namespace v3dg {
+
+// Values of the channels of ids. Instances and labels are numbered from 0.
+constexpr int32_t kNoInstance = -1, kMeshInstance = -2, kNoLabel = -1;
+
+// The channels of a picture, row major. Null planes are not computed.
+struct SensorPlanes {
+    // Depth of the gaussian behind which half of the light is gone; 0 if less is gone.
+    float* median_depth = nullptr;
+    float* normal = nullptr;  // (H, W, 3) in view space, unit length or 0
+    // The instance with the largest weight in a pixel, its label, and that weight.
+    int32_t* instance = nullptr;
+    int32_t* label = nullptr;
+    float* weight = nullptr;
+    // 1 where a gaussian is missing because its centre is before the near plane.
+    uint8_t* clipped = nullptr;
+
+    V3DG_HD bool wants_ids() const { return instance != nullptr || label != nullptr; }
+    V3DG_HD bool wants_strongest() const { return wants_ids() || weight != nullptr; }
+    // Returns whether any channel is found by walking the list of a tile.
+    V3DG_HD bool wants_walk() const {
+        return median_depth != nullptr || normal != nullptr || wants_strongest();
+    }
+    // Returns the planes from pixel `pixel` on.
+    V3DG_HD SensorPlanes from(size_t pixel) const {
+        const auto moved = [pixel](auto* plane, size_t width) {
+            return plane == nullptr ? nullptr : plane + width * pixel;
+        };
+        return {.median_depth = moved(median_depth, 1),
+                .normal = moved(normal, 3),
+                .instance = moved(instance, 1),
+                .label = moved(label, 1),
+                .weight = moved(weight, 1),
+                .clipped = moved(clipped, 1)};
+    }
+};
+
+// The light in which the colours of meshes are, and are mixed with those of gaussians.
+enum class MeshLight { display, linear };
+
+// The z-buffer of a picture of meshes, row major.
+struct MeshLayer {
+    const float* color = nullptr;       // (H, W, 3) straight, not premultiplied
+    const float* depth = nullptr;       // (H, W) in the unit of the gaussians' depths
+    const float* coverage = nullptr;    // (H, W) from 0 to 1
+    const float* normal = nullptr;      // (H, W, 3) in view space; null: unknown
+    const int32_t* instance = nullptr;  // (H, W); null: kMeshInstance
+    const int32_t* label = nullptr;     // (H, W); null: kNoLabel
+    MeshLight light = MeshLight::display;
+
+    V3DG_HD bool is_there() const { return depth != nullptr; }
+    // Returns the layer from pixel `pixel` on.
+    V3DG_HD MeshLayer from(size_t pixel) const {
+        const auto moved = [pixel](auto* plane, size_t width) {
+            return plane == nullptr ? nullptr : plane + width * pixel;
+        };
+        return {.color = moved(color, 3),
+                .depth = moved(depth, 1),
+                .coverage = moved(coverage, 1),
+                .normal = moved(normal, 3),
+                .instance = moved(instance, 1),
+                .label = moved(label, 1),
+                .light = light};
+    }
+};
+
+// The channels of one picture, and its meshes.
+struct Sensor {
+    SensorPlanes planes;
+    MeshLayer mesh;
+
+    V3DG_HD bool is_on() const {
+        return planes.wants_walk() || planes.clipped != nullptr || mesh.is_there();
+    }
+    V3DG_HD Sensor from(size_t pixel) const { return {planes.from(pixel), mesh.from(pixel)}; }
+};
+
+// The channels that are asked for.
+struct Channels {
+    bool median_depth = false, normal = false, instance = false, label = false, weight = false,
+         clipped = false;
+
+    bool any() const { return median_depth || normal || instance || label || weight || clipped; }
+};
+
+// The request for channels, and the meshes among which the gaussians are.
+struct SensorRequest {
+    Channels channels;
+    MeshLayer mesh;
+
+    bool is_on() const { return channels.any() || mesh.is_there(); }
+};
+
+}  // namespace v3dg

@@ -1,0 +1,197 @@
+#pragma once
+
+// Formulas of the sensor pass for one pixel, or a vector of pixels: what is summed from
+// front to back, and how the sums become channels. rasterize_math.h has alpha and the
+// stop rules, so that weights are those of the drawn colour.
+//
+// A mesh of coverage c at depth m divides the gaussians of a pixel into those in front,
+// whose depth is less than m, and those behind. The pixel is the mixture of c parts of
+// a picture in which the mesh hides what is behind it, and 1 - c parts of a picture
+// without the mesh. Both have the same transmittances in front of the mesh.
+
+#include "frame/sensor.h"
+#include "math/lanes.h"
+#include "math/quat.h"
+#include "math/vec.h"
+#include "math/view.h"
+#include "rasterize/rasterize_math.h"
+
+namespace v3dg {
+
+// At a transmittance of at most this, half of the light is gone.
+constexpr float kMedianTransmittance = 0.5f;
+
+// Stands for a mesh, or for nothing, where a record is named.
+constexpr uint32_t kMeshRecord = ~0u;
+
+// Returns the median depth of a pixel after a gaussian. `before` is the median depth up
+// to it, 0 if there is none. `t` is the transmittance behind it; a pixel that has
+// stopped passes no light. `passes` is the part of the light that a mesh in front lets
+// through; 1 without one.
+template <class V>
+V3DG_HD V3DG_INLINE V median_after(V before, V t, V passes, V depth) {
+    const V left = max_of(t, V{}) * passes;
+    const auto is_here = (before == V{}) & (left <= all_lanes<V>(Lane<V>(kMedianTransmittance)));
+    return is_here ? depth : before;
+}
+
+// Sums over the gaussians of a pixel that are in front of a mesh, or behind it.
+struct SensedSums {
+    float color[3], depth, normal[3];  // sums of weight times value
+    float weight;                      // largest weight
+    uint32_t record;                   // the first record with this weight
+};
+
+// The mesh in a pixel.
+struct SensedMesh {
+    float coverage, depth;
+    float passed;  // transmittance in front of the mesh; 0 if gaussians hide the mesh
+};
+
+// Factors that make weights of sums.
+struct SensedShares {
+    float front, mesh, behind;
+    float alpha;  // opacity of gaussians and meshes
+};
+
+// Returns the factors of a pixel whose list was blended. Without a mesh, or if it is
+// hidden, `mesh.coverage` is 0 and all sums are in front.
+V3DG_HD V3DG_INLINE SensedShares shares_of(float t, float min_transmittance,
+                                           const SensedMesh& mesh) {
+    if (mesh.coverage >= 1) return {1, mesh.passed, 0, 1};
+    const Finished<float> pixel = finished(t, min_transmittance);
+    const float without = (1 - mesh.coverage) * pixel.gain;
+    return {.front = without + mesh.coverage,
+            .mesh = mesh.coverage * mesh.passed,
+            .behind = without,
+            .alpha = (1 - mesh.coverage) * (1 - pixel.transmittance) + mesh.coverage};
+}
+
+// Whose weight is the largest in a pixel: a record, the mesh, or nothing.
+struct Strongest {
+    float weight;
+    uint32_t record;  // kMeshRecord: the mesh if the weight is positive
+};
+V3DG_HD V3DG_INLINE Strongest strongest_of(const SensedSums& front, const SensedSums& behind,
+                                           const SensedShares& share) {
+    Strongest out{share.front * front.weight, front.record};
+    if (share.mesh > out.weight) out = {share.mesh, kMeshRecord};
+    const float weight = share.behind * behind.weight;
+    if (weight > out.weight) out = {weight, behind.record};
+    return out;
+}
+
+// Sets the blended normal of a pixel, of length 1, or 0 if there is none.
+V3DG_HD V3DG_INLINE void blended_normal(const SensedSums& front, const SensedSums& behind,
+                                        const float* mesh_normal, const SensedShares& share,
+                                        float normal[3]) {
+    for (int k = 0; k < 3; ++k) {
+        normal[k] = share.front * front.normal[k] + share.behind * behind.normal[k];
+        if (mesh_normal != nullptr) normal[k] += share.mesh * mesh_normal[k];
+    }
+    const float length = sqrt_of(dot3(normal, normal));
+    for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] / length : 0.0f;
+}
+
+// Returns the expected depth of a pixel.
+V3DG_HD V3DG_INLINE float blended_depth(const SensedSums& front, const SensedSums& behind,
+                                        const SensedMesh& mesh, const SensedShares& share) {
+    const float sum = share.front * front.depth + share.behind * behind.depth +
+                      (share.mesh > 0 ? share.mesh * mesh.depth : 0.0f);
+    return share.alpha > 0 ? sum / share.alpha : 0.0f;
+}
+
+// Convert between display light (sRGB, IEC 61966-2-1) and linear light. Values above 1
+// follow the same curve, and negative values mirror it.
+V3DG_HD V3DG_INLINE float linear_of_display(float x) {
+    const float a = abs_of(x);
+    const float y = a <= 0.04045f ? a / 12.92f : powf((a + 0.055f) / 1.055f, 2.4f);
+    return x < 0 ? -y : y;
+}
+V3DG_HD V3DG_INLINE float display_of_linear(float x) {
+    const float a = abs_of(x);
+    const float y = a <= 0.0031308f ? a * 12.92f : 1.055f * powf(a, 1 / 2.4f) - 0.055f;
+    return x < 0 ? -y : y;
+}
+
+// Returns a channel of a pixel's colour, in display light. `without` is the colour of
+// the pixel without the mesh; `front` the sum of the gaussians in front; `mesh_color`
+// is in `light`, in which colours are mixed.
+V3DG_HD V3DG_INLINE float mixed_color(float without, float front, float mesh_color,
+                                      const SensedMesh& mesh, MeshLight light) {
+    const float c = mesh.coverage;
+    if (c <= 0) return without;
+    if (light == MeshLight::display) {
+        const float with = front + mesh.passed * mesh_color;
+        return c >= 1 ? with : (1 - c) * without + c * with;
+    }
+    const float opacity = 1 - mesh.passed;
+    const float in_front = opacity > 0 ? opacity * linear_of_display(front / opacity) : 0.0f;
+    const float with = in_front + mesh.passed * mesh_color;
+    return display_of_linear(c >= 1 ? with : (1 - c) * linear_of_display(without) + c * with);
+}
+
+// Computes the normal of a gaussian in view space: its shortest axis, the first one of
+// equals, turned towards the eye. `p` is the gaussian's mean in view space.
+V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float scale[3],
+                                            const ModelView<float>& view, const float p[3],
+                                            float normal[3]) {
+    int shortest = 0;
+    for (int k = 1; k < 3; ++k)
+        if (scale[k] < scale[shortest]) shortest = k;
+    float r[9];
+    rotation_of_quat(quat, r);
+    for (int i = 0; i < 3; ++i)
+        normal[i] = view.linear[3 * i] * r[shortest] + view.linear[3 * i + 1] * r[3 + shortest] +
+                    view.linear[3 * i + 2] * r[6 + shortest];
+    const float length = sqrt_of(dot3(normal, normal));
+    const float factor = (dot3(normal, p) > 0 ? -1.0f : 1.0f) / length;
+    for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] * factor : 0.0f;
+}
+
+// A gaussian that is not drawn because its mean is before the near plane, and whose
+// body, in which its alpha in space is at least 1/255, extends beyond that plane.
+struct ClippedBody {
+    double mean[3];     // in view space
+    double to_unit[9];  // row major; maps the body to a ball
+    double reach2;      // squared radius of the ball
+};
+
+// Sets a body. `axes` has its axes in view space as columns, row major. Returns false
+// if the body does not extend beyond the near plane.
+V3DG_HD V3DG_INLINE bool set_clipped_body(const double p[3], const double axes[9], double opacity,
+                                          double near_depth, ClippedBody& body) {
+    if (!(opacity >= kMinAlpha) || !(opacity <= 1)) return false;
+    body.reach2 = 2 * log(opacity / kMinAlpha);
+    double across = 0;
+    for (int k = 0; k < 3; ++k) {
+        body.mean[k] = p[k];
+        across += axes[6 + k] * axes[6 + k];
+        const double length2 =
+            axes[k] * axes[k] + axes[3 + k] * axes[3 + k] + axes[6 + k] * axes[6 + k];
+        if (!(length2 > 0)) return false;
+        for (int i = 0; i < 3; ++i) body.to_unit[3 * k + i] = axes[3 * i + k] / length2;
+    }
+    return p[2] < near_depth && p[2] + sqrt(body.reach2 * across) >= near_depth;
+}
+
+// Returns whether the ray from the eye through (x, y, 1) meets a body beyond the near
+// plane.
+V3DG_HD V3DG_INLINE bool meets_body(const ClippedBody& body, double x, double y,
+                                    double near_depth) {
+    double a[3], b[3], ab = 0, aa = 0;
+    for (int k = 0; k < 3; ++k) {
+        const double* row = body.to_unit + 3 * k;
+        a[k] = row[0] * x + row[1] * y + row[2];
+        b[k] = dot3(row, body.mean);
+        ab += a[k] * b[k];
+        aa += a[k] * a[k];
+    }
+    const double nearest = ab / aa;  // depth of the point that is nearest in the ball
+    const double depth = nearest > near_depth ? nearest : near_depth;
+    double distance2 = 0;
+    for (int k = 0; k < 3; ++k) distance2 += (depth * a[k] - b[k]) * (depth * a[k] - b[k]);
+    return distance2 <= body.reach2;
+}
+
+}  // namespace v3dg

@@ -1,0 +1,29 @@
+"""When a new cut is due."""
+
+from __future__ import annotations
+
+# At least so long between two cuts, and so many times as long as the last one took, so
+# that Blender stays usable while the view moves.
+_LEAST_PAUSE_S = 0.25
+_PAUSE_FACTOR = 2.0
+
+
+class Pace:
+    """Decides when a new cut is due, from times and from what the cut depends on."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+        self._not_before_s = 0.0
+
+    def is_due(self, key: object, now_s: float) -> bool:
+        """Return whether something has changed and the pause is over."""
+        return key != self._key and now_s >= self._not_before_s
+
+    def note(self, key: object, end_s: float, seconds: float) -> None:
+        """Record that the cut for a key took some seconds and has ended."""
+        self._key = key
+        self._not_before_s = end_s + max(_LEAST_PAUSE_S, _PAUSE_FACTOR * seconds)
+
+    def forget(self) -> None:
+        """Make a new cut due, after the pause."""
+        self._key = None

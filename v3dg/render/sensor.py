@@ -1,0 +1,187 @@
+"""Channels of pictures beside colour, and layers of meshes among which gaussians are
+drawn. docs/sensors.md defines them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from v3dg import _core
+from v3dg._numbers import MOST_FLOAT, check, check_type, one_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    from v3dg._device import HostArray
+    from v3dg.gaussians import Array
+
+Channel: TypeAlias = Literal[
+    "depth", "median_depth", "normal", "instance", "label", "weight", "clipped"
+]
+"""A channel that is drawn beside colour and alpha."""
+
+CHANNELS: tuple[Channel, ...] = get_args(Channel)
+MESH = -2
+"""The value of the channel `instance` where a mesh without ids is strongest."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshLayer:
+    """The z-buffer of a picture of meshes, from any renderer, for the same camera:
+    gaussians behind the meshes are hidden, and those in front are blended over them.
+
+    The planes are (H, W) for one camera, or (B, H, W) for a batch: arrays, or torch
+    tensors, which are copied to the host.
+
+    Attributes:
+        color: (..., 3) colour of the meshes, not multiplied by coverage.
+        depth: (...) depth of the meshes along the camera's axis, in world units. A
+            gaussian is in front if the depth of its centre is smaller.
+        coverage: (...) from 0 to 1, the part of the pixel that meshes cover. None
+            means 1 where the depth is positive and finite, else 0.
+        normal: (..., 3) in the axes of the camera (x right, y down, z forward); they
+            are normalised. None: meshes contribute no normals.
+        instance: (...) whole numbers for the channel `instance`; None means `MESH`.
+        label: (...) whole numbers for the channel `label`; None means -1.
+        light: The light of `color`, in which meshes and gaussians are mixed: "display"
+            (sRGB, as gaussians are trained) or "linear". The picture is in display
+            light with both.
+    """
+
+    color: Array
+    depth: Array
+    coverage: Array | None = None
+    normal: Array | None = None
+    instance: Array | None = None
+    label: Array | None = None
+    light: Literal["display", "linear"] = "display"
+
+    @cached_property
+    def core(self) -> _core.Mesh:
+        """The layer for the compiled operations.
+
+        Raises:
+            ValueError: A plane has the wrong shape or values.
+        """
+        one_of(self.light, "mesh.light", ("display", "linear"))
+        depth = _numbers(self.depth, "depth")
+        shape = depth.shape
+        check("mesh.depth", depth.ndim in (2, 3), f"shape (H, W) or (B, H, W), got {shape}")
+        coverage = self._coverage(depth)
+        is_wrong = (coverage > 0) & ~((depth > 0) & (depth <= MOST_FLOAT))
+        _refuse_any(depth, is_wrong, "depth", "positive finite depths where there is coverage")
+        color = _numbers(self.color, "color", (*shape, 3))
+        _refuse_any(color, ~np.isfinite(color), "color", "finite numbers")
+        return _core.Mesh(
+            color=color,
+            depth=depth,
+            coverage=coverage,
+            normal=self._unit_normals(shape),
+            instance=_ids(self.instance, "instance", shape),
+            label=_ids(self.label, "label", shape),
+            is_linear=self.light == "linear",
+        )
+
+    def _coverage(self, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        if self.coverage is None:
+            return ((depth > 0) & np.isfinite(depth)).astype(np.float32)
+        coverage = _numbers(self.coverage, "coverage", depth.shape)
+        _refuse_any(coverage, (coverage < 0) | (coverage > 1), "coverage", "numbers from 0 to 1")
+        return coverage
+
+    def _unit_normals(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32] | None:
+        if self.normal is None:
+            return None
+        normal = _numbers(self.normal, "normal", (*shape, 3))
+        _refuse_any(normal, ~np.isfinite(normal), "normal", "finite numbers")
+        length = np.linalg.norm(normal.astype(np.float64), axis=-1, keepdims=True)
+        return np.ascontiguousarray(normal / np.where(length > 0, length, 1), np.float32)
+
+
+def _array(values: Array, name: str) -> HostArray:
+    """Return an array or a tensor as a NumPy array; raise ValueError for others."""
+    array: HostArray
+    try:
+        if hasattr(values, "detach"):
+            array = values.numpy(force=True)
+        else:
+            array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError, AttributeError):
+        kind = type(values).__name__
+        raise ValueError(f"mesh.{name}: expected an array of numbers, got {kind}") from None
+    return array
+
+
+def _numbers(
+    values: Array, name: str, shape: tuple[int, ...] | None = None
+) -> npt.NDArray[np.float32]:
+    """Return a plane as float32; raise ValueError for NaN or another shape."""
+    array = _array(values, name)
+    check(f"mesh.{name}", array.dtype.kind in "biuf", f"an array of numbers, got {array.dtype}")
+    fits = shape is None or array.shape == shape
+    check(f"mesh.{name}", fits, f"shape {shape}, got {array.shape}")
+    with np.errstate(over="ignore"):
+        plane = np.ascontiguousarray(array, np.float32)
+    _refuse_any(plane, np.isnan(plane), name, "numbers")
+    return plane
+
+
+def _ids(values: Array | None, name: str, shape: tuple[int, ...]) -> npt.NDArray[np.int32] | None:
+    """Return a plane of ids as int32; raise ValueError for other kinds and shapes."""
+    if values is None:
+        return None
+    array = _array(values, name)
+    fits = array.dtype.kind in "iu" and array.shape == shape
+    expected = f"whole numbers of shape {shape}"
+    check(f"mesh.{name}", fits, f"{expected}, got {array.dtype} of shape {array.shape}")
+    range_of_int32 = np.iinfo(np.int32)
+    is_wrong = (array < range_of_int32.min) | (array > range_of_int32.max)
+    _refuse_any(array, is_wrong, name, "whole numbers that an int32 can hold")
+    return np.ascontiguousarray(array, np.int32)
+
+
+def _refuse_any(
+    array: npt.NDArray[np.generic], is_wrong: npt.NDArray[np.bool_], name: str, expected: str
+) -> None:
+    """Raise ValueError that names the first wrong value and its place."""
+    if not is_wrong.any():
+        return
+    place = tuple(int(number[0]) for number in np.nonzero(is_wrong))
+    text = ", ".join(map(str, place))
+    raise ValueError(f"mesh.{name}: expected {expected}, got {array[place]} at [{text}]")
+
+
+def sensor_of(
+    channels: Sequence[Channel], mesh: MeshLayer | None, cameras: object, *, depth: bool
+) -> tuple[bool, _core.Sensor | None]:
+    """Return whether depth is drawn, and the request for other channels and for meshes,
+    None for neither.
+
+    Raises:
+        TypeError: `channels` is no sequence of names, or `mesh` no `MeshLayer`.
+        ValueError: A channel is unknown, a plane of the mesh is invalid, or there is a
+            mesh for a list of cameras.
+    """
+    if isinstance(channels, tuple) and not channels and mesh is None:
+        return bool(depth), None  # fast path for most pictures
+    if not isinstance(channels, list | tuple | set | frozenset):
+        kind = type(channels).__name__
+        raise TypeError(f"channels: expected a sequence of names of channels, got {kind}")
+    for channel in channels:
+        one_of(channel, "channels", CHANNELS)
+    core_mesh = None
+    if mesh is not None:
+        check_type("mesh", mesh, MeshLayer, "a MeshLayer")
+        is_one = not isinstance(cameras, list | tuple)
+        check("mesh", is_one, "one camera, got a list; draw with Renderer.render_batch")
+        core_mesh = mesh.core
+    names: list[str] = [channel for channel in channels if channel != "depth"]
+    sensor = None
+    if names or core_mesh is not None:
+        sensor = _core.Sensor(names, core_mesh)
+    return bool(depth) or "depth" in channels, sensor
