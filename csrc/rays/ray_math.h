@@ -168,8 +168,8 @@ constexpr float kDirectionMargin = 4e-6f, kRelativeDirectionMargin = 1e-4f;
 // with the axes e (east) and n (north), the image of the ellipsoid q = reach2 is a
 // conic. Its extent in e is where the line x = k touches it:
 //   k = (-c S_eu ± sqrt(c² S_eu² + c S_ee (1 - c S_uu))) / (1 - c S_uu), c = reach2,
-// with the covariance S, and likewise in n. If 1 - c S_uu is not positive, the ellipsoid
-// reaches beside the eye, and the box has all directions.
+// with the covariance S, and likewise in n. If 1 - c S_uu is not positive, the
+// ellipsoid reaches beside the eye, and the box has all directions.
 //
 // A point (x, y) of the plane has the distance cos - y sin from the z axis along u, x
 // across it, and the height sin + y cos, where sin and cos are those of u's elevation.

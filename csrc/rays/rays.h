@@ -85,7 +85,7 @@ struct alignas(64) RayRecord {
 struct RayLimits {
     float nearest, farthest;
     float spacing;            // px of a screen-space filter, in radians
-    float min_transmittance;  // a ray ends behind the gaussian that leaves less than this
+    float min_transmittance;  // a ray ends when less than this is left
 };
 
 // The results, one per ray, row by row. Null planes are not written.

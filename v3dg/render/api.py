@@ -148,7 +148,6 @@ def render(
         opened_subject, camera = _with_first_camera(subject)
     else:
         opened_subject = opened(subject)
-    one_of(color_by, "color_by", get_args(ColorBy))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
     with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth)
     if isinstance(camera, EquirectangularCamera):
@@ -248,6 +247,7 @@ def _still_frame(
     Frames that differ only in `color_by` share a pool. If the size of the pool is
     given, only the last pool is kept.
     """
+    one_of(color_by, "color_by", get_args(ColorBy))
     if isinstance(subject, Gaussians):
         return frame_of(subject, color_by, device, memory, PoolSlot())
     is_sized = isinstance(memory, int)
