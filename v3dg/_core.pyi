@@ -362,6 +362,64 @@ class Ellipses:
     @property
     def radii(self) -> Array: ...
 
+class RaySensor:
+    """A sensor at one pose: rays of ascending azimuths and elevations. The camera has x
+    forward, y left and z up."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        azimuth: Float64,
+        elevation: Float64,
+        *,
+        far: float,
+        spacing: float,
+        min_transmittance: float,
+    ) -> None: ...
+
+class Cast:
+    """The results of casting rays: arrays of H rows and W columns."""
+
+    @property
+    def color(self) -> Float32: ...
+    @property
+    def alpha(self) -> Float32: ...
+    @property
+    def range(self) -> Float32: ...
+    @property
+    def returns(self) -> Float32: ...
+    @property
+    def gaussians(self) -> int: ...
+    @property
+    def tolerance_px2(self) -> float: ...
+    @property
+    def select_ms(self) -> float: ...
+    @property
+    def records(self) -> int: ...
+    @property
+    def entries(self) -> int: ...
+    @property
+    def project_ms(self) -> float: ...
+    @property
+    def bin_ms(self) -> float: ...
+    @property
+    def blend_ms(self) -> float: ...
+
+def cast_scene(
+    scene: ResidentScene,
+    models: list[Model],
+    sensor: RaySensor,
+    rule: Rule,
+    returns: tuple[float, float] | None = None,
+) -> Cast: ...
+def cast_model(
+    model: Model,
+    sensor: RaySensor,
+    *,
+    filter_px2: float,
+    antialiased: bool,
+    returns: tuple[float, float] | None = None,
+) -> Cast: ...
 def rasterize(
     gaussians: Rows,
     camera: Camera,
@@ -659,6 +717,7 @@ class Cameras:
         viewmats: (B, 4, 4).
         K: (B, 3, 3), or (3, 3) for all.
         environments: (B,), or None where each camera sees all instances.
+        lenses: The cameras on the CPU if some have lens distortion, or None.
     """
 
     def __init__(
@@ -670,6 +729,7 @@ class Cameras:
         height: int,
         near: float,
         environments: Array | None = None,
+        lenses: list[Camera] | None = None,
     ) -> None: ...
     def __len__(self) -> int: ...
 

@@ -1,5 +1,4 @@
-"""`v3dg.CameraBatch`: many pinhole cameras of one size, as arrays that change in
-place."""
+"""`v3dg.CameraBatch`: many cameras of one size, as arrays that change in place."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ import numpy.typing as npt
 from v3dg import _core
 from v3dg._device import CPU, Device, of
 from v3dg._numbers import MOST_INT, check, check_type, floats, positive, whole
-from v3dg.cameras import Camera, check_pinhole
+from v3dg.cameras import Camera
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,8 +24,8 @@ _WHOLE = ("torch.int32", "torch.int64")
 
 
 class CameraBatch:
-    """B pinhole cameras of one size, in the convention of `Camera`: x right, y down, z
-    forward.
+    """B cameras of one size, in the convention of `Camera`: x right, y down, z forward.
+    They are pinholes, apart from those of `CameraBatch.of`.
 
     Arrays on the host (NumPy, lists, torch tensors on the CPU) are copied, checked, and
     read-only.
@@ -40,6 +39,8 @@ class CameraBatch:
         viewmats: (B, 4, 4) world to camera, rotations and translations.
         K: (B, 3, 3) or (3, 3) for all: focal lengths and principal points in px,
             without skew.
+        lenses: The cameras if some have lens distortion, which only the CPU draws;
+            otherwise None.
         width, height: Size of each image in px.
         near: Gaussians whose mean lies nearer than this depth are not drawn.
         environments: (B,) the environment of each camera (see `Scene.environments`): it
@@ -68,6 +69,7 @@ class CameraBatch:
         self.viewmats: Array
         self.K: Array
         self.environments: Array | None = None
+        self.lenses: tuple[Camera, ...] | None = None
         if _is_on_device(viewmats):
             self._take_tensors(viewmats, K, environments)
         else:
@@ -128,7 +130,8 @@ class CameraBatch:
         *,
         environments: Array | npt.ArrayLike | None = None,
     ) -> CameraBatch:
-        """Return cameras of one size and one near plane as a batch.
+        """Return cameras of one size and one near plane as a batch. Cameras with lens
+        distortion are drawn on the CPU only.
 
         Raises:
             ValueError: There is no camera, or a size or a near plane differs.
@@ -138,11 +141,10 @@ class CameraBatch:
         check("cameras", cameras, "at least one, got none")
         for number, camera in enumerate(cameras):
             check_type(f"cameras[{number}]", camera, Camera, "a Camera")
-            check_pinhole(f"cameras[{number}]", camera, "draw such cameras one by one")
             is_alike = form_of(camera) == form_of(cameras[0])
             check(f"cameras[{number}]", is_alike, "the size and the near plane of the first one")
         first = cameras[0]
-        return cls(
+        batch = cls(
             np.stack([camera.viewmat for camera in cameras]),
             np.stack([camera.K for camera in cameras]),
             first.width,
@@ -150,6 +152,9 @@ class CameraBatch:
             first.near,
             environments=environments,
         )
+        if any(camera.is_distorted for camera in cameras):
+            batch.lenses = tuple(cameras)
+        return batch
 
     def __len__(self) -> int:
         return len(self.viewmats)
@@ -167,8 +172,11 @@ class CameraBatch:
 
         Raises:
             ValueError: The tensors are on another CUDA device, or the device is the
-                CPU and they are not.
+                CPU and they are not; or the device is not the CPU, and cameras have
+                lens distortion.
         """
+        is_drawn = self.lenses is None or not device.is_cuda
+        check("cameras", is_drawn, "pinholes on a CUDA device, got lenses; draw them one by one")
         expected = f"tensors on {device}, which draws, got some on {self.device}"
         check("cameras", self.device in (CPU, device), expected)
         if device not in self._on_device:
@@ -187,6 +195,9 @@ class CameraBatch:
         environments = None
         if self.environments is not None:
             environments = place(self.environments)
+        lenses = None
+        if self.lenses is not None:
+            lenses = [camera.core for camera in self.lenses]
         return _core.Cameras(
             viewmats=place(self.viewmats),
             K=place(self.K),
@@ -194,6 +205,7 @@ class CameraBatch:
             height=self.height,
             near=self.near,
             environments=environments,
+            lenses=lenses,
         )
 
 

@@ -460,6 +460,24 @@ def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Fl
     return np.array([[fx, 0.0, 0.5 * width], [0.0, fy, 0.5 * height], [0.0, 0.0, 1.0]])
 
 
+def level_axes(camera: Camera, up: Floats) -> Floats:
+    """Return the (3, 3) rotation from the world to a level frame, in which -y is up and
+    z is the horizontal direction of the camera; ValueError if it looks along
+    ``up``."""
+    check("up", up.any(), "a direction other than zero, got (0, 0, 0)")
+    axis = up / np.abs(up).max()  # prevents overflow and underflow of squares
+    axis /= np.linalg.norm(axis)
+    forward = camera.viewmat[2, :3] - axis * (camera.viewmat[2, :3] @ axis)
+    length = np.linalg.norm(forward)
+    check(
+        "up, camera",
+        length > 1e-6,
+        "a camera that does not look along `up`, got parallel directions",
+    )
+    forward = forward / length
+    return np.stack([np.cross(forward, axis), -axis, forward])
+
+
 def _focal(fov: float, name: str, side: int) -> float:
     """Return the focal length in px, from a field of view in radians and the px that it
     spans."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from v3dg._device import to_host
 from v3dg._numbers import Floats, check, vector, whole
-from v3dg.cameras import Camera, VectorLike, rigid
+from v3dg.cameras import Camera, VectorLike, level_axes, rigid
 from v3dg.image import Image
 from v3dg.pictures import MOST_SIDE
 
@@ -63,7 +63,7 @@ def draw_panorama(
     width = whole(width, "width", "an even number of px from 8 to 65,500", 8, MOST_SIDE)
     check("width", width % 2 == 0, f"an even number of px from 8 to 65,500, got {width}")
     height = width // 2
-    frame = _level_frame(camera, vector(up, "up"))
+    frame = level_axes(camera, vector(up, "up"))
     focal = _DENSITY * width / (2 * math.pi)
     side_px = 2 * math.ceil(_REACH * focal)
     K = np.array([[focal, 0, side_px / 2], [0, focal, side_px / 2], [0, 0, 1.0]])
@@ -92,23 +92,6 @@ def _side(longitude: float, latitude: float) -> Floats:
         [math.cos(latitude) * sine, -math.sin(latitude), math.cos(latitude) * cosine]
     )
     return np.stack([right, np.cross(forward, right), forward])
-
-
-def _level_frame(camera: Camera, up: Floats) -> Floats:
-    """Return the (3, 3) rotation from the world to the panorama's frame, in which -y is
-    up and z is the horizontal direction of the camera."""
-    check("up", up.any(), "a direction other than zero, got (0, 0, 0)")
-    axis = up / np.abs(up).max()  # prevents overflow and underflow of squares
-    axis /= np.linalg.norm(axis)
-    forward = camera.viewmat[2, :3] - axis * (camera.viewmat[2, :3] @ axis)
-    length = np.linalg.norm(forward)
-    check(
-        "up, camera",
-        length > 1e-6,
-        "a camera that does not look along `up`, got parallel directions",
-    )
-    forward = forward / length
-    return np.stack([np.cross(forward, axis), -axis, forward])
 
 
 def _add(

@@ -3,11 +3,13 @@
 // The cameras of a batch, and a batch of pictures that has been drawn.
 
 #include <memory>
+#include <optional>
 #include <vector>
 
 #include "bindings/array.h"
 #include "bindings/drawing.h"
 #include "bindings/sensor.h"
+#include "bindings/types.h"
 #include "frame/image.h"
 
 namespace v3dg {
@@ -24,9 +26,10 @@ class BoundCameras {
   public:
     // viewmats: (B, 4, 4) world to camera. K: (B, 3, 3), or (3, 3) for all cameras.
     // environments: (B,) int32 or int64, or None for cameras that see all instances.
-    // Arrays on the host are float64 and int32, and are checked.
+    // Arrays on the host are float64 and int32, and are checked. lenses: the B cameras
+    // themselves, if some have lens distortion, on the host only; or None.
     BoundCameras(py::object viewmats, py::object K, int width, int height, double near,
-                 py::object environments);
+                 py::object environments, const std::optional<std::vector<BoundCamera>>& lenses);
 
     Device device() const { return device_; }
     size_t size() const { return size_; }
@@ -39,6 +42,8 @@ class BoundCameras {
     // Environments as int32 or int64; null if the cameras see all instances.
     const void* environments() const { return environments_; }
     bool are_environments_long() const { return are_environments_long_; }
+    // The cameras if some have lens distortion; otherwise empty.
+    const std::vector<Camera>& lenses() const { return lenses_; }
 
   private:
     py::object viewmats_object_, intrinsics_object_, environments_object_;
@@ -49,6 +54,7 @@ class BoundCameras {
     Reals viewmats_{}, intrinsics_{};
     bool shares_intrinsics_ = false, are_environments_long_ = false;
     const void* environments_ = nullptr;
+    std::vector<Camera> lenses_;
 };
 
 // The planes of a batch: arrays that belong to the caller, or new ones.

@@ -48,7 +48,8 @@ py::object fault_of_cameras(const py::array& viewmats, const py::array& K) {
 }  // namespace
 
 BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int height, double near,
-                           py::object environments)
+                           py::object environments,
+                           const std::optional<std::vector<BoundCamera>>& lenses)
     : viewmats_object_(std::move(viewmats)),
       intrinsics_object_(std::move(K)),
       environments_object_(std::move(environments)),
@@ -65,6 +66,14 @@ BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int hei
         intrinsics_ = reals_of(device_, intrinsics_object_, "K", {3, 3});
     else
         intrinsics_ = reals_of(device_, intrinsics_object_, "K", {count, 3, 3});
+    if (lenses) {
+        check_is_on_host(device_, "lenses", "expected cameras on the CPU, got arrays on a device");
+        bool fits = lenses->size() == size_;
+        for (const BoundCamera& camera : *lenses)
+            fits = fits && camera.width() == width && camera.height() == height;
+        if (!fits) refuse_value("lenses", "expected one camera of this size for each pose");
+        for (const BoundCamera& camera : *lenses) lenses_.push_back(camera.camera);
+    }
     if (environments_object_.is_none()) return;
     are_environments_long_ = device_ != kHost && has_dtype(environments_object_, "int64");
     if (are_environments_long_)
@@ -133,8 +142,10 @@ void BoundPlanes::check(const BoundCameras& cameras, Device device) const {
 void bind_batch(py::module_& m) {
     m.def("fault_of_cameras", &fault_of_cameras, "viewmats"_a, "K"_a);
     py::class_<BoundCameras>(m, "Cameras", "The cameras of a batch; borrows the arrays.")
-        .def(py::init<py::object, py::object, int, int, double, py::object>(), py::kw_only(),
-             "viewmats"_a, "K"_a, "width"_a, "height"_a, "near"_a, "environments"_a = py::none())
+        .def(py::init<py::object, py::object, int, int, double, py::object,
+                      const std::optional<std::vector<BoundCamera>>&>(),
+             py::kw_only(), "viewmats"_a, "K"_a, "width"_a, "height"_a, "near"_a,
+             "environments"_a = py::none(), "lenses"_a = py::none())
         .def("__len__", &BoundCameras::size);
     py::class_<BoundPlanes>(m, "BatchPlanes", "The planes of a batch; keeps the arrays.")
         .def(py::init<py::object, py::object, py::object>(), "color"_a, "alpha"_a = py::none(),

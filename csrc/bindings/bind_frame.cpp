@@ -66,6 +66,15 @@ struct BoundLook {
     bool is_aside = false;
 };
 
+// Throws ValueError if the channel `clipped` is requested for another camera than a
+// pinhole.
+void check_clipped(const SensorRequest& request, const Camera& camera) {
+    if (request.channels.clipped && !camera.is_pinhole())
+        throw py::value_error(
+            "channels: 'clipped' is defined for pinholes, got a camera with another lens; leave "
+            "it out");
+}
+
 // Returns the request for channels and meshes in pictures of these eyes. `sensor` is a
 // BoundSensor or None; its mesh must be on the device.
 SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes, Device device) {
@@ -75,10 +84,7 @@ SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes, Device devic
         held<BoundSensor>(sensor, "sensor").request(device, {window.height(), window.width()});
     if (request.mesh.is_there() && eyes.are_two)
         throw py::value_error("mesh: expected one camera, got two eyes; draw each eye separately");
-    if (request.channels.clipped && !eyes.camera[0].is_pinhole())
-        throw py::value_error(
-            "channels: 'clipped' is defined for pinholes, got a camera with another lens; leave "
-            "it out");
+    check_clipped(request, eyes.camera[0]);
     return request;
 }
 
@@ -263,6 +269,7 @@ class BoundSceneFrame {
                                              cameras.height(), cameras.width()};
         const SensorRequest request = held<BoundSensor>(sensor, "sensor").request(kHost, shape);
         check_sensor(device_, request);
+        for (const Camera& camera : cameras.lenses()) check_clipped(request, camera);
         return {.planes = channels.allocate(device_, request.channels, shape),
                 .mesh = request.mesh};
     }

@@ -151,6 +151,7 @@ class DrawnBatch final : public BoundBatch {
 
 // Returns the cameras of arrays on the host. The arrays are float64.
 std::vector<Camera> cameras_of(const BoundCameras& arrays) {
+    if (!arrays.lenses().empty()) return arrays.lenses();
     const auto* viewmats = static_cast<const double*>(arrays.viewmats().data);
     const auto* intrinsics = static_cast<const double*>(arrays.intrinsics().data);
     const size_t stride = arrays.shares_intrinsics() ? 0 : 9;

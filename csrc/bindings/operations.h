@@ -21,6 +21,7 @@ void bind_pool(pybind11::module_& m);
 void bind_sensor(pybind11::module_& m);
 void bind_batch(pybind11::module_& m);
 void bind_frame(pybind11::module_& m);
+void bind_rays(pybind11::module_& m);
 void bind_fit_level(pybind11::module_& m);
 void bind_first_selected(pybind11::module_& m);
 

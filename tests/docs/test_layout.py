@@ -31,6 +31,7 @@ MAY_INCLUDE = {
     "project": {"base", "math", "camera", "frame", "quantize"},
     "tile_bin": {"base", "math", "frame"},
     "rasterize": {"base", "math", "frame"},
+    "rays": {"base", "math", "frame", "quantize", "project"},
     "fit_group": {"base", "math", "camera", "frame", "project", "tile_bin", "rasterize"},
     "draw": {
         "base",
@@ -43,6 +44,7 @@ MAY_INCLUDE = {
         "project",
         "tile_bin",
         "rasterize",
+        "rays",
     },
     "levels": {
         "base",
@@ -94,6 +96,7 @@ NOT_OPERATIONS = {
     "io",
     "frame",
     "residency",
+    "rays",
     "draw",
     "levels",
     "c_interface",

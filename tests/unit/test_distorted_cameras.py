@@ -299,14 +299,44 @@ def test_wrong_lenses_are_refused(case):
         Camera(np.eye(4), K, 200, 120, **changes)
 
 
+def test_a_batch_of_lenses_is_drawn_as_its_cameras_alone(lens):
+    rng = np.random.default_rng(4)
+    scene = scene_around(rng)
+    cameras = [
+        *views(rng, lens, 2),
+        replace(next(views(rng, lens, 1)), distortion=(), model="PINHOLE"),
+    ]
+    renderer = v3dg.Renderer(scene, device="cpu", memory=None)
+    batch = renderer.render_batch(v3dg.CameraBatch.of(cameras), depth=True)
+    for number, camera in enumerate(cameras):
+        alone = renderer.render(camera, depth=True)
+        assert alone.alpha.max() > 0.5
+        assert_same_bytes(batch[number], alone)
+        rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+        directions = camera.directions(np.column_stack([columns.ravel(), rows.ravel()]))
+        lengths = np.nan_to_num(np.linalg.norm(directions, axis=1)).reshape(rows.shape)
+        distance = batch.distance[number]
+        np.testing.assert_allclose(distance, alone.depth * lengths, rtol=1e-5)
+        assert (distance > 0).any()
+    with pytest.raises(ValueError, match=r"^channels: 'clipped' is defined for pinholes"):
+        renderer.render_batch(v3dg.CameraBatch.of(cameras), channels=["clipped"])
+
+
+@pytest.mark.gpu
+def test_a_batch_of_lenses_is_refused_on_cuda(lens):
+    camera = camera_of(lens)
+    rng = np.random.default_rng(0)
+    renderer = v3dg.Renderer(lod_bundle(rng, blob(rng, 100), 16), device="cuda", memory=None)
+    with pytest.raises(ValueError, match=r"^cameras: expected pinholes on a CUDA device"):
+        renderer.render_batch(v3dg.CameraBatch.of([camera, camera]))
+
+
 def test_what_needs_a_pinhole_says_so(lens):
     camera = camera_of(lens)
     rng = np.random.default_rng(0)
     bundle = lod_bundle(rng, blob(rng, 100), 16)
     with pytest.raises(ValueError, match=r"^left: expected a pinhole, got OPENCV"):
         StereoCamera.of(camera, 0.06)
-    with pytest.raises(ValueError, match=r"^cameras\[0\]: expected a pinhole, got OPENCV"):
-        v3dg.CameraBatch.of([camera, camera])
     with pytest.raises(ValueError, match=r"^footprint: expected 'solid_angle' for a distorted"):
         select(bundle, camera, footprint="paper", device="cpu")
     with pytest.raises(ValueError, match=r"^cameras\[0\]: expected a pinhole, got OPENCV"):

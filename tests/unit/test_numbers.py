@@ -87,6 +87,21 @@ CALLS = {
         lambda **given: v3dg.draw_panorama(drawn_small, CAMERA, **given),
         {"up": (0.1, 0.9, 0.3), "width": 8},
     ),
+    "EquirectangularCamera": (
+        v3dg.EquirectangularCamera,
+        {"viewmat": EYE4, "width": 8, "near": 0.01},
+    ),
+    "Lidar": (
+        v3dg.Lidar,
+        {
+            **{"azimuth": (0, 1), "elevation": (0, 0.2), "near": 0.1, "far": 9.0, "gap": 0.5},
+            **{"detection": 0.1, "spacing": 0.01},
+        },
+    ),
+    "scan": (
+        lambda **given: v3dg.scan(BUNDLE, v3dg.Lidar((0, 1), (0, 0.2)), **given),
+        {"pose": EYE4, "tolerance": 1.0, "min_level": 0},
+    ),
     "Scene.add": (
         lambda **given: v3dg.Scene().add(BUNDLE, **given),
         {

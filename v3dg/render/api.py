@@ -14,19 +14,21 @@ from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_cam
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
-from v3dg.image import RenderedImage
+from v3dg.image import Image, RenderedImage
 from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
+from v3dg.render.rays import check_rays, draw_sphere
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
 from v3dg.render.sensor import Channel, MeshLayer, mesh_device, sensor_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
+from v3dg.spherical import EquirectangularCamera
 from v3dg.upright import direction_of, up_of
 
 if TYPE_CHECKING:
@@ -61,11 +63,15 @@ def render(
 ) -> tuple[RenderedImage, RenderedImage]: ...
 @overload
 def render(
+    subject: Subject | File, camera: EquirectangularCamera, **options: Unpack[_Options]
+) -> Image: ...
+@overload
+def render(
     subject: Subject | File, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[RenderedImage]: ...
 def render(
     subject: Subject | File,
-    camera: Camera | StereoCamera | Sequence[Camera] | None = None,
+    camera: Camera | StereoCamera | EquirectangularCamera | Sequence[Camera] | None = None,
     *,
     tolerance: float | None = None,
     budget: int | None = None,
@@ -80,7 +86,7 @@ def render(
     mesh: MeshLayer | None = None,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
-) -> _Pictures:
+) -> Image | _Pictures:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
@@ -99,7 +105,10 @@ def render(
             The two eyes of a stereo camera share one cut and one frame. Their two
             pictures have common statistics, which are sums, except for the number of
             selected gaussians. None means the first camera of a scene's file, else the
-            camera of `first_camera`.
+            camera of `first_camera`. An `EquirectangularCamera` is drawn on the CPU
+            with all gaussians resident, without statistics, and takes none
+            of `budget`, `cut`, `min_transmittance`, `mesh`, channels other than
+            "depth", and a number of bytes as `memory`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -136,14 +145,17 @@ def render(
             the budget; on CUDA the latter is raised when the picture is used.
         RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
     """
-    chosen_device = _device.resolve(device)
     if camera is None:
         opened_subject, camera = _with_first_camera(subject)
     else:
         opened_subject = opened(subject)
-    one_of(color_by, "color_by", get_args(ColorBy))
-    frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
+    if isinstance(camera, EquirectangularCamera):
+        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth)
+        check_rays(color_by, cut, sensor, min_transmittance, device, memory)
+        return draw_sphere(opened_subject, camera, cut_request, background, depth=with_depth)
+    chosen_device = _device.resolve(device)
+    frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
     place = mesh_device(chosen_device, opened_subject)
     with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=place)
@@ -239,6 +251,7 @@ def _still_frame(
     Frames that differ only in `color_by` share a pool. If the size of the pool is
     given, only the last pool is kept.
     """
+    one_of(color_by, "color_by", get_args(ColorBy))
     if isinstance(subject, Gaussians):
         return frame_of(subject, color_by, device, memory, PoolSlot())
     is_sized = isinstance(memory, int)

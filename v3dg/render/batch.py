@@ -10,7 +10,7 @@ import numpy as np
 
 from v3dg import _core
 from v3dg._device import Device
-from v3dg._numbers import check, check_type
+from v3dg._numbers import Floats, check, check_type
 from v3dg.camera_batch import CameraBatch, form_of
 from v3dg.cameras import Camera
 from v3dg.image import ChannelPlanes, Planes, RenderedImage, Sensed, Stats
@@ -266,7 +266,9 @@ def draw_batch(
 def ray_lengths(cameras: CameraBatch, depth: Array | None = None) -> Array:
     """Return (B, H, W) or (1, H, W) lengths of the vectors from the eyes through the
     centres of pixels to depth 1, in double precision: on the host, or as a tensor where
-    `depth` is."""
+    `depth` is. The depth of a fisheye is a length already."""
+    if cameras.lenses is not None:
+        return np.stack([_ray_lengths_of_lens(camera) for camera in cameras.lenses])
     K: Array = cameras.K
     columns: Array = np.arange(cameras.width) + 0.5
     rows: Array = np.arange(cameras.height) + 0.5
@@ -283,6 +285,14 @@ def ray_lengths(cameras: CameraBatch, depth: Array | None = None) -> Array:
     x = (columns[None, :] - K[:, 0, 2, None]) / K[:, 0, 0, None]
     y = (rows[None, :] - K[:, 1, 2, None]) / K[:, 1, 1, None]
     return (x[:, None, :] ** 2 + y[:, :, None] ** 2 + 1) ** 0.5
+
+
+def _ray_lengths_of_lens(camera: Camera) -> Floats:
+    """Return (H, W); 0 where a lens shows nothing."""
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    directions = camera.directions(np.column_stack([columns.ravel(), rows.ravel()]))
+    lengths = np.nan_to_num(np.linalg.norm(directions, axis=1))
+    return np.asarray(lengths.reshape(camera.height, camera.width))
 
 
 def check_planes(planes: BatchPlanes | None, *, with_depth: bool) -> None:

@@ -266,6 +266,14 @@ def _calls(shared, work):
     def drawn_at_once(**values):
         v3dg.Renderer(scene, device="cpu").render_batch(**values)
 
+    def drawn_all_around(**values):
+        v3dg.render(scene, v3dg.EquirectangularCamera(**values), tolerance=50.0)
+
+    def scanned_by(**values):
+        v3dg.scan(scene, v3dg.Lidar(**values), np.eye(4), tolerance=50.0)
+
+    lidar = v3dg.Lidar(np.linspace(0, 6, 9), np.linspace(-1, 1, 4))
+
     def drawn_among(**values):
         channels = ("depth", "normal", "label", "weight")
         mesh = v3dg.MeshLayer(**values)
@@ -333,6 +341,33 @@ def _calls(shared, work):
                 "up": (0, 0, 1),
                 "fov_x": 0.8,
                 **view,
+            },
+        ),
+        "EquirectangularCamera": (
+            drawn_all_around,
+            {"viewmat": np.eye(4), "width": 16, "near": 0.01},
+        ),
+        "Lidar": (
+            scanned_by,
+            {
+                "azimuth": lidar.azimuth,
+                "elevation": lidar.elevation,
+                "near": 0.1,
+                "far": 90.0,
+                "gap": 0.5,
+                "detection": 0.1,
+                "spacing": 0.02,
+            },
+        ),
+        "scan": (
+            v3dg.scan,
+            {
+                "subject": scene,
+                "lidar": lidar,
+                "pose": np.stack([np.eye(4)] * 2),
+                "tolerance": 50.0,
+                "min_level": 0,
+                "device": "cpu",
             },
         ),
         "CameraBatch": (

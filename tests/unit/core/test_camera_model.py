@@ -47,6 +47,17 @@ def test_distorted_models_agree_with_finite_differences_and_cull_nothing_drawn(
     assert (done.returncode, done.stdout) == (0, "")
 
 
+@pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
+def test_boxes_of_directions_hold_every_point_of_a_gaussian(tmp_path: Path) -> None:
+    program = tmp_path / "ray_boxes"
+    source = ROOT / "tests" / "cpp" / "ray_boxes.cpp"
+    command = [compiler(), "-std=c++20", "-O1", "-I", CSRC, source, "-o", program]
+    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert compiled.returncode == 0, compiled.stderr
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
 def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
     """All other code names Intrinsics, so that another model needs only a file and an
     entry in camera/camera.h."""
