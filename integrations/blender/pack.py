@@ -3,8 +3,8 @@
     pip wheel --wheel-dir wheels v3dg
     python integrations/blender/pack.py v3dg_blender.zip wheels/*.whl
 
-The wheels must be those of Blender's Python and system: use the Python of the same
-version. NumPy is in Blender already, and left out.
+The wheels must be those for Blender's Python and operating system, so run this with
+the same version of Python. NumPy is left out, because Blender contains it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def pack(archive: Path, wheels: list[Path]) -> None:
             raise ValueError(f"{wheel}: expected the file of a wheel; make them with pip wheel")
     packed = [wheel for wheel in wheels if not wheel.name.startswith(_IN_BLENDER)]
     lines = [f'  "./wheels/{wheel.name}",' for wheel in packed]
-    # Tables of TOML end at the next one, so what belongs to the top comes before them.
+    # In TOML, keys of the top level must come before the first table.
     manifest = (FOLDER / MANIFEST).read_text(encoding="utf-8")
     top, table, permissions = manifest.partition("[permissions]")
     listed = "\n".join(["wheels = [", *lines, "]", "", ""])
@@ -44,7 +44,7 @@ def pack(archive: Path, wheels: list[Path]) -> None:
 
 def main() -> None:
     if len(sys.argv) < 3:
-        sys.exit("pack.py: expected an archive to write and wheels, got less")
+        sys.exit("pack.py: expected an archive to write and wheels, got fewer arguments")
     try:
         pack(Path(sys.argv[1]), [Path(name) for name in sys.argv[2:]])
     except (OSError, ValueError) as error:

@@ -107,7 +107,7 @@ def test_the_page_of_a_release_is_its_part_of_the_changelog():
 def test_a_version_without_notes_is_refused():
     done = ci("notes", "9.9.9")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "CHANGELOG.md: expected a part for [9.9.9] that says something\n"
+    assert done.stderr == "CHANGELOG.md: expected a section for [9.9.9] with text, got none\n"
 
 
 def test_wheels_are_not_begun_for_what_is_no_python():

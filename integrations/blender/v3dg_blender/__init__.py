@@ -1,6 +1,6 @@
 """Worlds of Gaussian splats in Blender, under one budget (docs/blender.md).
 
-The add-on needs the package v3dg, whose wheel its archive holds (`pack.py`).
+The add-on needs the package v3dg. Its archive contains the wheel (`pack.py`).
 """
 
 try:

@@ -1,8 +1,8 @@
 """The different cuts of a selection, and their gaussians.
 
-Instances of a bundle whose cuts are equal share one: most of a large world is far away,
-where each instance is one cluster, so thousands of instances need few cuts. The cuts
-are v3dg's own, neither quantised nor joined: the picture is that of the selection.
+Instances of a bundle with equal cuts share one cut. Most instances of a large world are
+far away and consist of one cluster each, so thousands of instances need few cuts. Cuts
+are not changed, quantised or merged: the picture is that of the selection.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 class Cut(NamedTuple):
-    """Clusters of a bundle, as instances of equal appearance show them.
+    """Clusters of a bundle, with the opacity and the tint of their instances.
 
-    `digest` names the cut in data blocks of Blender. It depends on the file of the
-    bundle, with its size and time, on the clusters, and on opacity and tint.
+    `digest` identifies the cut in data blocks of Blender. It depends on the file of the
+    bundle, its size and modification time, the clusters, the opacity and the tint.
     """
 
     bundle: v3dg.Bundle
@@ -69,18 +69,18 @@ def distinct_cuts(selection: v3dg.Selection) -> dict[int, Cut]:
 
 
 def _file_identity(bundle: v3dg.Bundle) -> str:
-    """Return what changes when the bundle in a file changes."""
+    """Return the path, size and modification time of a bundle's file."""
     assert bundle.path is not None
     status = os.stat(bundle.path)
     return f"{os.path.realpath(bundle.path)} {status.st_size} {status.st_mtime_ns}"
 
 
 def gaussians_of(cuts: Sequence[Cut]) -> list[v3dg.Gaussians]:
-    """Return the gaussians of cuts, as an instance without a pose has them: standing
-    upright, z up; opacities and tints are multiplied in, SH are rotated."""
+    """Return the gaussians of cuts for an instance at the origin that stands upright,
+    with z up. SH are rotated, and opacities and tints are applied."""
     result: dict[str, v3dg.Gaussians] = {}
     for bundle in dict.fromkeys(cut.bundle for cut in cuts):
-        # One gather a bundle, so that all of its cuts keep the SH degree of the bundle.
+        # All cuts of a bundle are gathered at once, so they have the bundle's SH degree.
         of_bundle = [cut for cut in cuts if cut.bundle is bundle]
         for cut, gaussians in zip(of_bundle, _gathered(bundle, of_bundle), strict=True):
             result[cut.digest] = gaussians

@@ -1,7 +1,7 @@
-"""Draws gaussians in versions of Blender that have no splats of their own.
+"""Draws gaussians in versions of Blender that cannot draw splats.
 
-A node group places an ellipsoid at each point, three standard deviations large. Its
-material is as opaque as the gaussian is where the ray comes closest to the mean, as in
+A node group places an ellipsoid at each point, with radii of three standard deviations.
+Its opacity is that of the gaussian at the point of the ray where it is largest, as in
 Moenne-Loccoz et al., 3D Gaussian Ray Tracing (2024): in the frame of the gaussian, a
 ray through p along the unit vector d has the squared distance p.p - (p.d)^2.
 """
@@ -14,12 +14,12 @@ from contextlib import contextmanager
 import bpy
 
 NAME = "v3dg ellipsoids"
-_RADIUS = 3.0  # in standard deviations: 1 % of the opacity is left there
-_SUBDIVISIONS = 2  # of an icosahedron: 80 triangles
+_RADIUS = 3.0  # in standard deviations; 1 % of the opacity is left there
+_SUBDIVISIONS = 2  # subdivisions of an icosahedron, which then has 80 triangles
 
 
 def material() -> bpy.types.Material:
-    """Return the material of ellipsoids, which the file gets when it has none."""
+    """Return the material of ellipsoids, and create it if the file has none."""
     if NAME in bpy.data.materials:
         return bpy.data.materials[NAME]
     result = bpy.data.materials.new(NAME)
@@ -93,7 +93,7 @@ def _vector_math(
 
 
 def node_group() -> bpy.types.NodeTree:
-    """Return the node group that places ellipsoids, which the file gets when it has
+    """Return the node group that places ellipsoids, and create it if the file has
     none."""
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
@@ -131,8 +131,8 @@ def add_modifier(target: bpy.types.Object) -> None:
 
 @contextmanager
 def hidden(targets: Sequence[bpy.types.Object]) -> Iterator[None]:
-    """Draw no ellipsoids for a while, so that a dependency graph has the copies of mesh
-    objects themselves, and not those of their ellipsoids."""
+    """Draw no ellipsoids inside the context, so that a dependency graph contains copies
+    of mesh objects and not of their ellipsoids."""
     modifiers = [target.modifiers[NAME] for target in targets if NAME in target.modifiers]
     visible = [modifier for modifier in modifiers if modifier.show_viewport]
     for modifier in visible:

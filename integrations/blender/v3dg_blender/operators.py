@@ -1,4 +1,4 @@
-"""Operators: open, update, place, and save. Errors are reports of Blender."""
+"""Operators that open, update, place and save. Errors are shown as Blender's reports."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Result: TypeAlias = set[str]
 
 FINISHED = {"FINISHED"}
 CANCELLED = {"CANCELLED"}
-# Transparency in front of a surface that Cycles follows; its default of 8 leaves holes
-# in clouds of gaussians.
+# Number of transparent surfaces through which Cycles follows a ray. Its default of 8
+# leaves holes in clouds of gaussians.
 _TRANSPARENT_BOUNCES = 256
 
 
 def reported(operator: bpy.types.Operator, work: Callable[[], list[str]]) -> Result:
-    """Do an operator's work, and report what a user can be wrong about, and the
-    warnings that the work returns."""
+    """Do the work of an operator. Report its warnings, and errors that a user can
+    cause."""
     try:
         warnings = work()
     except (OSError, ValueError, ImportError) as error:
@@ -38,8 +38,8 @@ def reported(operator: bpy.types.Operator, work: Callable[[], list[str]]) -> Res
 
 
 def _absolute(path: str) -> str:
-    """Return the path that a file selector or a script gave, which may be relative to
-    the .blend file."""
+    """Return the absolute path for a path of a file selector or a script, which may be
+    relative to the .blend file."""
     absolute: str = bpy.path.abspath(path)
     return os.path.abspath(absolute)
 
@@ -62,7 +62,7 @@ def open_file(context: bpy.types.Context, path: str) -> list[str]:
     """Open a bundle at the 3D cursor, or a scene. Return warnings.
 
     Raises:
-        ValueError: The file is neither, or invalid.
+        ValueError: The file is neither of these, or it is invalid.
         OSError: The file cannot be read.
     """
     name = os.path.basename(path)
@@ -90,8 +90,8 @@ def open_file(context: bpy.types.Context, path: str) -> list[str]:
 
 
 def prepare(scene: bpy.types.Scene) -> None:
-    """Set what renders of gaussians need."""
-    # Cuts are chosen in the thread of a render, while the interface must not draw.
+    """Change the settings of a scene for renders of gaussians."""
+    # Cuts are chosen in the render thread. Meanwhile, the interface must not draw.
     scene.render.use_lock_interface = True
     cycles = getattr(scene, "cycles", None)
     if cycles is not None:
@@ -138,7 +138,7 @@ def _add_camera(
 
 
 class V3DG_OT_update(bpy.types.Operator):
-    """Choose a new cut for the viewport, else for the active camera"""
+    """Choose a new cut for the viewport, or for the active camera if there is none"""
 
     bl_idname = "v3dg.update"
     bl_label = "Update the Cut"
@@ -161,7 +161,7 @@ class V3DG_OT_update(bpy.types.Operator):
 
 
 class V3DG_OT_place(bpy.types.Operator):
-    """Put an instance of the active object's bundle at each selected empty"""
+    """Add an instance of the active object's bundle at each selected empty"""
 
     bl_idname = "v3dg.place"
     bl_label = "Place at Empties"
@@ -189,7 +189,7 @@ class V3DG_OT_place(bpy.types.Operator):
 
 
 class V3DG_OT_save_scene(bpy.types.Operator, ExportHelper):
-    """Write all instances and cameras that are rendered as a scene of v3dg"""
+    """Write all rendered instances and cameras to a scene file of v3dg"""
 
     bl_idname = "v3dg.save_scene"
     bl_label = "Save v3dg Scene"
@@ -223,7 +223,7 @@ def save_scene(context: bpy.types.Context, path: str) -> list[str]:
     }
     v3dg.write_scene(path, scene, cameras=cameras)
     return [
-        f"{item.name}: left out, because scene files have perspective cameras only"
+        f"{item.name}: left out, because scene files support only perspective cameras"
         for item in items
         if item.name not in cameras
     ]

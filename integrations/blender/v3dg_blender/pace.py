@@ -1,15 +1,18 @@
-"""When a new cut is due."""
+"""Decides when a new cut is due."""
 
 from __future__ import annotations
 
-# At least so long between two cuts, and so many times as long as the last one took, so
-# that Blender stays usable while the view moves.
+# The pause after a cut is at least this long, and at least this many times the duration
+# of the cut, so that Blender stays responsive while the view moves.
 _LEAST_PAUSE_S = 0.25
 _PAUSE_FACTOR = 2.0
 
 
 class Pace:
-    """Decides when a new cut is due, from times and from what the cut depends on."""
+    """Decides when a new cut is due, from times and a key.
+
+    The key contains all values on which a cut depends.
+    """
 
     def __init__(self) -> None:
         self._key: object = None
@@ -20,7 +23,7 @@ class Pace:
         return key != self._key and now_s >= self._not_before_s
 
     def note(self, key: object, end_s: float, seconds: float) -> None:
-        """Record that the cut for a key took some seconds and has ended."""
+        """Record that the cut for a key has ended and took some seconds."""
         self._key = key
         self._not_before_s = end_s + max(_LEAST_PAUSE_S, _PAUSE_FACTOR * seconds)
 

@@ -1,4 +1,4 @@
-"""What the add-on stores in a .blend file: settings of a scene, and of an instance."""
+"""The settings of scenes and instances that the add-on stores in a .blend file."""
 
 import bpy
 
@@ -12,7 +12,7 @@ def _expect_change(settings: bpy.types.PropertyGroup, context: bpy.types.Context
 
 
 class SceneSettings(bpy.types.PropertyGroup):
-    """`scene.v3dg`"""
+    """The settings of a scene, `scene.v3dg`."""
 
     viewport_budget: bpy.props.IntProperty(
         name="Viewport",
@@ -30,16 +30,16 @@ class SceneSettings(bpy.types.PropertyGroup):
     )
     tolerance_px2: bpy.props.FloatProperty(
         name="Tolerance",
-        description="Largest area on the screen, in px² for each gaussian, up to which coarser "
-        "gaussians replace finer ones; the budget raises it where it must",
+        description="Largest screen area of a gaussian, in px², up to which coarser gaussians "
+        "replace finer ones. It is raised if the cut exceeds the budget",
         default=v3dg.DEFAULT_TOLERANCE,
         min=0.0,
         soft_max=100.0,
     )
     culls: bpy.props.BoolProperty(
         name="Only in View",
-        description="Spend the budget on what the camera sees. Switch it off for mirrors and "
-        "shadows, which show what is outside the picture",
+        description="Spend the budget on instances that the camera sees. Switch it off if "
+        "mirrors or shadows show objects outside the picture",
         default=True,
     )
     follows: bpy.props.BoolProperty(
@@ -50,7 +50,8 @@ class SceneSettings(bpy.types.PropertyGroup):
 
 
 class InstanceSettings(bpy.types.PropertyGroup):
-    """`object.v3dg`; an object without a bundle is not an instance."""
+    """The settings of an object, `object.v3dg`. An object without a bundle is not an
+    instance."""
 
     bundle: bpy.props.StringProperty(
         name="Bundle",

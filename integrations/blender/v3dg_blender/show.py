@@ -1,4 +1,4 @@
-"""Shows the cut of a view: gives each instance the data block of its cut."""
+"""Shows the cut of a view: assigns to each instance the data block of its cut."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Shown:
-    """What a view shows."""
+    """Counts of the instances, gaussians and data blocks that a view shows."""
 
     num_instances: int = 0
     num_gaussians: int = 0
@@ -46,8 +46,8 @@ def show(
 ) -> Shown:
     """Choose one cut for all instances, and show it.
 
-    An object has one data block, so its copies by collections and geometry nodes all
-    show the cut of the copy that needs most, and count with it in the budget.
+    An object has one data block. So all of its copies by collections and geometry nodes
+    show the finest cut that any of them needs, and count with it in the budget.
 
     Raises:
         ValueError: The coarsest cut exceeds the budget.
@@ -58,7 +58,7 @@ def show(
         choice = _choose(placed, camera, tolerance_px2, allowed, culls=culls)
         if budget is None or choice.counts.num_gaussians <= budget:
             break
-        # Copies show more than they need, so they are given less.
+        # Copies show more than they need, so the next selection has a smaller budget.
         assert allowed is not None
         allowed = allowed * budget // choice.counts.num_gaussians
     blocks = splats.ensure_blocks({cut.digest: cut for cut in choice.cuts.values()}.values())
@@ -87,7 +87,7 @@ def _choose(
     result = {placed[number].source: cut for number, cut in cuts.items()}
     num_placements = Counter(item.source for item in placed)
     num_in_view = Counter(placed[number].source for number in cuts)
-    # What one copy does not show may be in view of another.
+    # A cluster outside the view of one copy may be in the view of another.
     copied = [placed[number] for number in cuts if num_placements[placed[number].source] > 1]
     whole = v3dg.select(_scene_of(copied), camera, tolerance=selection.tolerance, cull=False)
     finest = {item.source: 0 for item in copied}

@@ -1,4 +1,4 @@
-"""Data blocks that hold the gaussians of a cut.
+"""Data blocks that contain the gaussians of a cut.
 
 Blender 5.3 and later draw point clouds of the type GAUSSIAN_SPLAT. Their attributes,
 as Blender's own import of .ply files makes them:
@@ -58,8 +58,8 @@ def data_blocks() -> dict[str, bpy.types.ID]:
 
 
 def ensure_blocks(cuts: Iterable[Cut]) -> dict[str, bpy.types.ID]:
-    """Return a data block for each cut, by digest, and one of `EMPTY`. Those that the
-    file already has are used again."""
+    """Return a data block for each cut, by digest, and an empty one for `EMPTY`. Blocks
+    that the file already has are reused."""
     blocks = data_blocks()
     missing = [cut for cut in cuts if cut.digest not in blocks]
     for cut, gaussians in zip(missing, gaussians_of(missing), strict=True):
@@ -99,7 +99,7 @@ def _fill(block: bpy.types.ID, gaussians: v3dg.Gaussians) -> None:
     opacities = np.asarray(gaussians.opacities, np.float32)[:, None]
     _write(block, "position", "FLOAT_VECTOR", np.asarray(gaussians.means, np.float32))
     quats = np.asarray(gaussians.quats, np.float32)
-    # Blender does not normalise them.
+    # Blender does not normalise quaternions.
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     _write(block, "rotation", "QUATERNION", quats)
     _write(block, "scale", "FLOAT_VECTOR", np.asarray(gaussians.scales, np.float32))
@@ -113,7 +113,7 @@ def _fill(block: bpy.types.ID, gaussians: v3dg.Gaussians) -> None:
     block.update_tag()
 
 
-# The property of an element that holds the values of an attribute of a type.
+# The property of an element that has the value of an attribute, by the attribute's type.
 _VALUES = {
     "FLOAT_VECTOR": "vector",
     "QUATERNION": "value",
@@ -130,7 +130,7 @@ def _write(block: bpy.types.ID, name: str, kind: str, values: Floats) -> None:
 
 
 def linear_of_srgb(colors: Floats) -> Floats:
-    """Return linear colours of sRGB, clamped at 0 (IEC 61966-2-1)."""
+    """Return the linear values of sRGB colours, clamped at 0 (IEC 61966-2-1)."""
     clamped = np.maximum(colors, 0)
     curve = ((clamped + 0.055) / 1.055) ** 2.4
     return np.where(clamped <= 0.04045, clamped / 12.92, curve).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Cameras of v3dg for what Blender draws: the camera of a render, and a 3D viewport.
+"""Converts Blender's views to cameras of v3dg: render cameras and 3D viewports.
 
 Blender's cameras look along -z with y up, v3dg's along z with y down. Blender describes
 every lens by a projection matrix, so one function converts all of them.
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     Floats = npt.NDArray[np.float64]
 
-# An orthographic view is selected for by a pinhole this many times further away than
-# the view is high: depths within the view then change sizes by at most a hundredth.
+# For selection, a distant pinhole replaces an orthographic view. Its distance is this
+# many heights of the view, so that depths within one height change sizes by at most 1 %.
 _FAR = 100.0
 
 
@@ -48,7 +48,7 @@ def camera_of_projection(
         cy = 0.5 * height * (1 + projection[1, 2])
     else:
         distance = _FAR * 2 / projection[1, 1]
-        # The point in the middle of the view stays in the middle of the picture.
+        # The point at the centre of the view stays at the centre of the picture.
         x = -projection[0, 3] / projection[0, 0]
         y = -projection[1, 3] / projection[1, 1]
         position = position + rotation.T @ np.array([x, y, distance])
@@ -66,7 +66,7 @@ def camera_of_projection(
 
 
 def _pose(view_from_world: Floats) -> tuple[Floats, Floats]:
-    """Return the exact rotation (3, 3) nearest to a view's, and the eye (3,)."""
+    """Return the exact rotation (3, 3) nearest to that of a view, and the eye (3,)."""
     world_from_view: Floats = np.linalg.inv(view_from_world).astype(np.float64)
     left, _, right = np.linalg.svd(world_from_view[:3, :3])
     rotation: Floats = (left @ right).T
@@ -106,7 +106,7 @@ def render_camera(
 def viewport_camera(
     region: bpy.types.Region, view: bpy.types.RegionView3D, near: float
 ) -> v3dg.Camera:
-    """Return the camera of a 3D viewport, as it looks now."""
+    """Return the current camera of a 3D viewport."""
     return camera_of_projection(
         np.array(view.view_matrix),
         np.array(view.window_matrix),

@@ -1,9 +1,9 @@
-"""Follows viewports and renders: chooses a new cut when what they show has changed.
+"""Follows viewports and renders: chooses a new cut when a view or a scene has changed.
 
-A timer looks at the viewports, because Blender reports no change of a view. It compares
-what a cut depends on with that of the last cut, so the data blocks that a cut exchanges
-start no other. Handlers of renders run in the thread of the render, for which
-`operators.prepare` locks the interface.
+A timer polls the viewports, because Blender does not report when a view changes. It
+compares the values on which a cut depends with those of the last cut. New data blocks
+are not among these values, so showing a cut does not make another one due. Handlers of
+renders run in the thread of the render; `operators.prepare` locks the interface for it.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class Viewport(NamedTuple):
         return (*numbers, self.region.width, self.region.height, self.near)
 
     def camera(self) -> v3dg.Camera:
-        """Return the camera of the viewport as it looks now."""
+        """Return the current camera of the viewport."""
         return views.viewport_camera(self.region, self.view, self.near)
 
 
 class _State:
-    """What the timer and the handlers know between two calls."""
+    """State of the timer and the handlers between two calls."""
 
     def __init__(self) -> None:
         self.pace = Pace()
@@ -57,12 +57,12 @@ _state = _State()
 
 
 def status() -> str:
-    """Return what is shown, or why nothing new is, in one line."""
+    """Return one line: counts of what is shown, or the reason why no new cut is shown."""
     return _state.status
 
 
 def set_status(counts: show.Shown) -> None:
-    """Record what is shown."""
+    """Record counts of what is shown."""
     _state.status = (
         f"{counts.num_gaussians:,} gaussians of {counts.num_instances:,} instances in "
         f"{counts.num_blocks:,} data blocks"
@@ -106,7 +106,8 @@ def current_viewport() -> Viewport | None:
 
 
 def _look() -> float:
-    """Choose a new cut for the viewport if one is due; return when to look again."""
+    """Choose a new cut for the viewport if one is due. Return the seconds until the
+    next poll."""
     scene = bpy.context.scene
     if scene is None or _state.is_rendering or not scene.v3dg.follows:
         return _LOOK_EVERY_S
@@ -152,7 +153,7 @@ def _may_move_instances(update: bpy.types.DepsgraphUpdate) -> bool:
     if not isinstance(item, bpy.types.Object):
         return isinstance(item, bpy.types.Collection)
     if item.v3dg.bundle:
-        # Its geometry is that of its cut.
+        # The geometry of an instance changes only with its cut.
         return bool(update.is_updated_transform)
     is_scatter = any(modifier.type == "NODES" for modifier in item.modifiers)
     has_changed = update.is_updated_transform or update.is_updated_geometry
@@ -178,15 +179,15 @@ def _show_render(scene: bpy.types.Scene, *unused: object) -> None:
         return
     depsgraph = bpy.context.evaluated_depsgraph_get()
     if scene.frame_current != _state.evaluated_frame:
-        # A render evaluates the frames of an animation in a graph of its own.
+        # A render evaluates the frames of an animation in a separate dependency graph.
         scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)
         _state.evaluated_frame = scene.frame_current
         depsgraph = bpy.context.evaluated_depsgraph_get()
     try:
         set_status(show.show_render(scene, depsgraph))
     except (OSError, ValueError) as error:
-        # A handler cannot cancel a render, nor report: the message is in the console
-        # and in the panel, and the picture has the cut that was shown before.
+        # A handler can neither cancel a render nor report an error. So the message goes
+        # to the console and the panel, and the picture shows the previous cut.
         _state.status = str(error)
         print(f"v3dg: {error}")
 

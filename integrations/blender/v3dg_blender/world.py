@@ -1,8 +1,8 @@
-"""Instances in a scene of Blender, and the scene of v3dg that they are.
+"""Instances in a scene of Blender, and their conversion to and from scenes of v3dg.
 
-An instance is an object whose `v3dg.bundle` names a file. Its pose is that of the
-object, applied to a bundle that stands upright: an object without a rotation shows its
-asset with z up. Lengths are Blender's units.
+An instance is an object whose `v3dg.bundle` names a file. The pose of the object is
+applied to the upright bundle, so an object without a rotation shows its asset with z
+up. Lengths are in Blender's units.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
     Floats = npt.NDArray[np.float64]
 
-# In Blender, a sensor is this many mm wide unless the camera says otherwise.
+# The default width of a camera's sensor in Blender.
 _SENSOR_MM = 36.0
 # Largest relative deviation of an object's matrix from a similarity.
 _SIMILAR = 1e-4
 
 
 class Placed(NamedTuple):
-    """A bundle's instance in the world: an object, or a copy of it that another object
-    makes."""
+    """An instance of a bundle in the world: an object, or a copy of it that another
+    object makes."""
 
     source: bpy.types.Object
     matrix: Floats  # (4, 4)
@@ -56,7 +56,7 @@ def bundle_path(instance: bpy.types.Object) -> str:
 
 
 def open_bundle(path: str) -> v3dg.Bundle:
-    """Return the bundle in a file. It is opened again when the file has changed.
+    """Return the bundle in a file, which is reopened if the file has changed.
 
     Raises:
         OSError: The file cannot be read.
@@ -81,8 +81,8 @@ def close_bundles() -> None:
 
 
 def sources() -> list[bpy.types.Object]:
-    """Return all objects of the file that show a bundle. Copies show objects that need
-    not be in the scene themselves."""
+    """Return all objects of the file that show a bundle. Copies in a scene may show
+    objects outside of the scene."""
     return [item for item in bpy.data.objects if item.v3dg.bundle and item.type != "EMPTY"]
 
 
@@ -106,7 +106,7 @@ def visible(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[Plac
 def own_placements(
     items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph
 ) -> list[Placed]:
-    """Return objects at their own poses, at the time of a dependency graph."""
+    """Return objects at their own poses, as evaluated by a dependency graph."""
     return [
         Placed(item, np.array(item.evaluated_get(depsgraph).matrix_world, np.float64))
         for item in items
@@ -120,15 +120,15 @@ def copies(depsgraph: bpy.types.Depsgraph) -> list[Placed]:
         if not copy.is_instance or copy.parent is None:
             continue
         source = copy.object.original
-        # Copies that an instance makes of itself are parts of its picture.
+        # Copies with the instance itself as parent are its ellipsoids.
         if source.v3dg.bundle and copy.parent.original != source:
             result.append(Placed(source, np.array(copy.matrix_world, np.float64)))
     return result
 
 
 def _shown_copies(depsgraph: bpy.types.Depsgraph) -> list[Placed]:
-    """Return copies for which cuts are chosen. Copies of ellipsoids cannot be told
-    from copies of their objects, so there are none before Blender 5.3."""
+    """Return copies for which cuts are chosen. Before Blender 5.3 there are none,
+    because copies of ellipsoids cannot be distinguished from copies of objects."""
     if splats.has_splats():
         return copies(depsgraph)
     return []
@@ -137,10 +137,10 @@ def _shown_copies(depsgraph: bpy.types.Depsgraph) -> list[Placed]:
 def add_instances(
     scene: v3dg.Scene, items: Sequence[bpy.types.Object], matrices: npt.ArrayLike
 ) -> None:
-    """Add objects to a scene of v3dg, at similarities (I, 4, 4)."""
+    """Add objects to a scene of v3dg with the poses (I, 4, 4), which are similarities."""
     if not items:
         return
-    # Thousands of instances have few files, of which each is looked up once.
+    # Thousands of instances refer to few files, so each file is looked up only once.
     examples = {(item.v3dg.bundle, item.library): item for item in items}
     bundles = {key: open_bundle(bundle_path(item)) for key, item in examples.items()}
     scene.add(
@@ -155,9 +155,9 @@ def add_instances(
 
 
 def nearest_similarities(matrices: Floats) -> Floats:
-    """Return (I, 4, 4) similarities that are as large as the longest axis of each
-    matrix. Blender may stretch and mirror an object, which v3dg's cuts need not know:
-    they are then a little finer than necessary."""
+    """Return (I, 4, 4) similarities whose scales are the largest scales of matrices.
+    Blender may stretch and mirror an object, but selection supports only similarities.
+    Cuts of such objects are a little finer than necessary."""
     linear = matrices[:, :3, :3]
     left, sizes, right = np.linalg.svd(linear)
     left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
@@ -167,7 +167,7 @@ def nearest_similarities(matrices: Floats) -> Floats:
 
 
 def similarity_problem(matrix: Floats) -> str | None:
-    """Return in what a matrix (4, 4) is not a similarity, or None."""
+    """Return the reason why a matrix (4, 4) is not a similarity, or None."""
     linear = matrix[:3, :3]
     size = float(np.linalg.norm(linear, axis=0).max())
     gram = linear.T @ linear
@@ -197,7 +197,7 @@ def new_instance(
 
 
 def add_scene(scene: v3dg.Scene, collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Add an object for each instance of a scene, whose `up` (else z) becomes z.
+    """Add an object for each instance of a scene. The scene's `up` (else z) becomes z.
 
     Raises:
         ValueError: A bundle is at a URL.
@@ -227,16 +227,16 @@ def add_scene(scene: v3dg.Scene, collection: bpy.types.Collection) -> list[bpy.t
 
 
 def turn_upright(scene: v3dg.Scene) -> Floats:
-    """Return the rotation (3, 3) of a scene's `up` (else z) to z."""
+    """Return the rotation (3, 3) from a scene's `up` (else z) to z."""
     quaternion = mathutils.Quaternion(turn_between(scene.up or "z", "z"))
     result: Floats = np.array(quaternion.to_matrix(), np.float64)
     return result
 
 
 def set_camera(camera: bpy.types.Object, source: v3dg.Camera, turn: Floats) -> None:
-    """Give a camera object of Blender the pose and the lens of a pinhole, after a
-    rotation (3, 3) of the world. Blender has one focal length for both axes, so pixels
-    that are not square become square."""
+    """Set the pose and the lens of a camera object of Blender to those of a pinhole,
+    after a rotation (3, 3) of the world. Blender has one focal length for both axes, so
+    pixels that are not square become square."""
     viewmat = np.array(source.viewmat)
     world_from_view = np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
     world_from_view[:3] = turn @ world_from_view[:3]
@@ -251,21 +251,21 @@ def set_camera(camera: bpy.types.Object, source: v3dg.Camera, turn: Floats) -> N
 
 
 def _turn_back(bundle: v3dg.Bundle) -> mathutils.Quaternion:
-    """Return the rotation from a bundle that stands upright to the bundle."""
+    """Return the rotation from the upright bundle to the bundle."""
     scene = v3dg.Scene()
     scene.add(bundle, up="z")
     return mathutils.Quaternion(scene.quaternions[0]).inverted()
 
 
 def placed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[Placed]:
-    """Return what a scene file holds: all instances that are rendered, empties with a
-    bundle, and copies that collections and geometry nodes make."""
+    """Return the instances of a scene file: all instances that are rendered, empties
+    with a bundle, and copies that collections and geometry nodes make."""
     items = [item for item in scene.objects if item.v3dg.bundle and not item.hide_render]
     return [*own_placements(items, depsgraph), *copies(depsgraph)]
 
 
 def as_scene(items: Iterable[Placed]) -> v3dg.Scene:
-    """Return the scene that v3dg writes.
+    """Return a scene of v3dg with these instances.
 
     Raises:
         ValueError: An instance is stretched, sheared or mirrored.
@@ -277,7 +277,7 @@ def as_scene(items: Iterable[Placed]) -> v3dg.Scene:
         if problem is not None:
             raise ValueError(
                 f"{item.source.name}: expected a rotation, a translation and one positive scale, "
-                f"got {problem}; scale it alike along all axes"
+                f"got {problem}; use the same scale along all axes"
             )
     scene = v3dg.Scene()
     scene.up = "z"
@@ -286,6 +286,6 @@ def as_scene(items: Iterable[Placed]) -> v3dg.Scene:
 
 
 def _exact(matrix: Floats) -> Floats:
-    """Return a similarity without the rounding of single precision."""
+    """Return a similarity without its rounding errors of single precision."""
     result: Floats = nearest_similarities(matrix[None])[0]
     return result
