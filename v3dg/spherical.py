@@ -186,7 +186,8 @@ class Lidar:
         azimuth = _angles(self.azimuth, "azimuth", 4 * math.pi)
         elevation = _angles(self.elevation, "elevation", math.pi / 2)
         near = positive(self.near, "near")
-        far = real(self.far, "far", "a distance beyond `near`, or infinity", near)
+        far = real(self.far, "far", "a positive distance, or infinity", 5e-324)
+        check("near, far", near <= far, f"near up to far, got {near:g} and {far:g}")
         detection = real(self.detection, "detection", "a share above 0, up to 1", 1e-6, 1)
         table = RayTable.of(azimuth, elevation)
         spacing = self.spacing

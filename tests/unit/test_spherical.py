@@ -312,7 +312,7 @@ ERRORS = {
     "azimuth: expected finite": lambda: Lidar(np.array([math.nan]), np.zeros(1)),
     "elevation: expected radians": lambda: Lidar(np.zeros(1), np.array([2.0])),
     "spacing: expected an angle": lambda: Lidar(np.zeros(1), np.zeros(1)),
-    "far: expected a distance": lambda: replace(LIDAR, far=0.01),
+    "near, far: expected near up to far": lambda: replace(LIDAR, far=0.01),
     "gap: expected a positive": lambda: replace(LIDAR, gap=0),
     "detection: expected a share": lambda: replace(LIDAR, detection=0),
     "width: expected an even": lambda: EquirectangularCamera(np.eye(4), 33),
