@@ -252,7 +252,7 @@ static void draw(const HostTable& table, Cloud& cloud, const Row& row) {
     SelectRule rule{};
     rule.tolerance_px2 = 1.0f;
     const FrameRequest request{.eyes = camera_at(0, 6, kWidth, kHeight), .rule = rule, .shade = {}};
-    const SceneFrameCounts counts = cpu::draw_scene(scene, request, rule, {&picture, 1});
+    const SceneFrameCounts counts = cpu::draw_scene(scene, request, rule, {&picture, 1}, {});
     double sum = 0;
     for (const float value : color) sum += value;
     std::printf("drawn %lld, mean colour %.4f\n", static_cast<long long>(counts.gaussians),
