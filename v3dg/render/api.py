@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 
 _MOST_PIXELS_A_CALL = 1 << 22
+_Camera: TypeAlias = "Camera | StereoCamera | EquirectangularCamera | Sequence[Camera]"
 _Pictures: TypeAlias = RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]
 
 
@@ -71,7 +72,7 @@ def render(
 ) -> list[RenderedImage]: ...
 def render(
     subject: Subject | File,
-    camera: Camera | StereoCamera | EquirectangularCamera | Sequence[Camera] | None = None,
+    camera: _Camera | None = None,
     *,
     tolerance: float | None = None,
     budget: int | None = None,
@@ -145,13 +146,10 @@ def render(
             the budget; on CUDA the latter is raised when the picture is used.
         RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
     """
-    if camera is None:
-        opened_subject, camera = _with_first_camera(subject)
-    else:
-        opened_subject = opened(subject)
+    opened_subject, camera = _with_camera(subject, camera)
     cut_request = CutRequest(tolerance, budget, min_level, fade)
     if isinstance(camera, EquirectangularCamera):
-        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth)
+        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=_device.CPU)
         check_rays(color_by, cut, sensor, min_transmittance, device, memory)
         return draw_sphere(opened_subject, camera, cut_request, background, depth=with_depth)
     chosen_device = _device.resolve(device)
@@ -228,6 +226,13 @@ def first_camera(
     direction = vector(up, "up")
     check("up", direction.any(), "a direction other than zero, got (0, 0, 0)")
     return frame_subject(content).camera(direction, width, height)
+
+
+def _with_camera(subject: Subject | File, camera: _Camera | None) -> tuple[Subject, _Camera]:
+    """Return an opened subject and the camera, or its default camera for None."""
+    if camera is None:
+        return _with_first_camera(subject)
+    return opened(subject), camera
 
 
 def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
