@@ -85,7 +85,7 @@ def include_options(csrc: Path) -> list[str]:
         options += ["-isystem", sysconfig.get_path("include")]
     if (cuda := cuda_headers()) is not None:
         options += ["-isystem", str(cuda)]
-    # Clang has a header of OpenMP only with libomp-dev. Otherwise GCC's header suffices,
+    # Clang has a header of OpenMP only with libomp-dev. Otherwise that of GCC suffices,
     # without an attribute with an argument that Clang does not know.
     if compiler := shutil.which("g++"):
         command = [compiler, "-print-file-name=include"]

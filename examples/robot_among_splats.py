@@ -18,9 +18,11 @@ import numpy.typing as npt
 import tyro
 
 import v3dg
+from v3dg.cameras import Axis
 from v3dg.donut import make_donut
 from v3dg.pictures import write_picture
 from v3dg.render import Channel
+from v3dg.rotations import rotation_from_quaternion, turn_between
 
 Floats = npt.NDArray[np.float64]
 Light = Literal["display", "linear"]
@@ -42,6 +44,8 @@ class Config:
     """Picture to write."""
     assets: tuple[Path, ...] = ()
     """Further assets, which stand behind the robot."""
+    up: Axis = "z"
+    """Axis that is up in these assets."""
     gaussians: int = 30_000
     """Number of gaussians of a donut."""
     steps: int = 0
@@ -240,11 +244,15 @@ def make_scene(config: Config) -> v3dg.Scene:
         label=FOOD_LABEL,
     )
     for number, path in enumerate(config.assets):
-        bundle = v3dg.build_bundle(v3dg.read_asset(path), config=build)
-        bounds = np.concatenate([bundle.clusters.box.min(0), bundle.clusters.box.max(0)])
-        size = float(np.ptp(bounds.reshape(-1, 3), axis=0).max())
-        place = (-2.2 + 2.4 * number, 1.6, 1.2)
-        scene.add(bundle, place, scales=2.4 / size, up="z", label=FOOD_LABEL + 1 + number)
+        asset = v3dg.read_asset(path)
+        turn = turn_between(config.up, "z")
+        points = asset.means @ rotation_from_quaternion(turn).T
+        low, high = np.percentile(points, (1, 99), axis=0)
+        scale = 2.2 / (high - low).max()
+        middle = np.append((low[:2] + high[:2]) / 2, low[2])
+        place = np.array([-2.3 + 3.6 * number, 1.7, 0]) - scale * middle
+        bundle = v3dg.build_bundle(asset, config=build)
+        scene.add(bundle, place, turn, scale, label=FOOD_LABEL + 1 + number)
     return scene
 
 

@@ -20,6 +20,7 @@ Uint8: TypeAlias = NDArray[np.uint8]
 
 fade_filter_px2: float
 has_cuda: bool
+has_openmp: bool
 min_alpha: float
 sh_base0: float
 stops_before: float

@@ -1,14 +1,21 @@
-"""Writing files that are either complete or absent, and safe access to untrusted
-files."""
+"""Writing files that are either complete or absent, safe access to untrusted files, and
+locks.
+
+Windows lacks much of POSIX: reads at offsets, permissions, open folders, and moving a
+file that is open. All differences between systems are in this module and in `_system`.
+"""
 
 import contextlib
 import errno
+import hashlib
 import os
 import re
 import secrets
 import stat
+import tempfile
 import threading
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +23,39 @@ import numpy.typing as npt
 
 from v3dg._numbers import check
 
+try:
+    import fcntl
+except ImportError:
+    fcntl = None  # type: ignore[assignment]
+
 _PIECE_BYTES = 16 << 20
 _MASK_LOCK = threading.Lock()
-_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+_POSITION_LOCK = threading.Lock()
+# The offset of the byte that a lock on Windows covers. Others cannot read a locked
+# byte, so it is behind every content, and below the largest offset of file systems.
+_LOCKED_BYTE = 1 << 43
+
+PLAIN = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+"""Flags of every `os.open`: child processes do not inherit the file, and Windows
+converts no line ends."""
+
+NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+"""Flag of `os.open`: fail for a symbolic link. Windows follows it."""
+
+NO_WAIT = getattr(os, "O_NONBLOCK", 0)
+"""Flag of `os.open`: opening a pipe does not wait for its other end. The flag has no
+effect on regular files."""
+
+OPEN_SAFELY = NO_LINK | NO_WAIT | PLAIN
+
+HAS_FOLDER_DESCRIPTORS = os.open in os.supports_dir_fd and hasattr(os, "O_DIRECTORY")
+"""Whether the system opens folders, and names files relative to an open folder."""
+
+_FLUSHED_MODE = "rb"
+if fcntl is None:
+    _FLUSHED_MODE = "r+b"
+
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | PLAIN
 
 
 @contextlib.contextmanager
@@ -62,18 +99,25 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
     the replaced file."""
     replaced = status_of_replaced(path)
     with naming_errors(path, os.fspath(private)):
-        with open(private, "rb") as file:
-            descriptor = file.fileno()
-            if replaced is None:
-                os.fchmod(descriptor, 0o666 & ~file_mode_mask())
-            else:
-                with contextlib.suppress(OSError):
-                    os.fchown(descriptor, -1, replaced.st_gid)
-                with contextlib.suppress(OSError):
-                    os.fchown(descriptor, replaced.st_uid, -1)
-                os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
-            os.fsync(descriptor)
+        # Windows flushes only files that may be written.
+        with open(private, _FLUSHED_MODE) as file:
+            if hasattr(os, "fchown"):
+                _set_permissions(file.fileno(), replaced)
+            os.fsync(file.fileno())
         os.replace(private, os.path.realpath(path))
+
+
+def _set_permissions(descriptor: int, replaced: os.stat_result | None) -> None:
+    """Give a file the permissions, owner and group of the file that it replaces, or the
+    permissions of a new file."""
+    if replaced is None:
+        os.fchmod(descriptor, 0o666 & ~file_mode_mask())
+        return
+    with contextlib.suppress(OSError):
+        os.fchown(descriptor, -1, replaced.st_gid)
+    with contextlib.suppress(OSError):
+        os.fchown(descriptor, replaced.st_uid, -1)
+    os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
 
 
 def file_mode_mask(status_path: str = "/proc/self/status") -> int:
@@ -108,7 +152,7 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
     )
     # Renaming checks only the permissions of the folder. Opening the file checks the
     # permissions of the file itself.
-    os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
+    os.close(os.open(path, os.O_WRONLY | PLAIN))
     return status
 
 
@@ -144,7 +188,7 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
     signals are handled in between."""
     view = memoryview(data)
     while view:
-        count = os.pwrite(descriptor, view[:_PIECE_BYTES], offset)
+        count = _write_some(descriptor, view[:_PIECE_BYTES], offset)
         view = view[count:]
         offset += count
 
@@ -154,12 +198,93 @@ def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
     too short."""
     view = out.reshape(-1).view(np.uint8).data
     while view:
-        count = os.preadv(descriptor, [view[:_PIECE_BYTES]], offset)
+        count = _read_some(descriptor, view[:_PIECE_BYTES], offset)
         if count == 0:
             return False
         view = view[count:]
         offset += count
     return True
+
+
+def read_bytes_at(descriptor: int, num_bytes: int, offset: int) -> bytes:
+    """Return at most `num_bytes` bytes of a file at an offset; fewer at its end."""
+    out = bytearray(num_bytes)
+    count = _read_some(descriptor, memoryview(out), offset)
+    return bytes(out[:count])
+
+
+def _read_some(descriptor: int, out: memoryview, offset: int) -> int:
+    if hasattr(os, "preadv"):
+        return os.preadv(descriptor, [out], offset)
+    # The position belongs to the open file, so only one thread may use it.
+    with _POSITION_LOCK:
+        os.lseek(descriptor, offset, os.SEEK_SET)
+        data = os.read(descriptor, len(out))
+    out[: len(data)] = data
+    return len(data)
+
+
+def _write_some(descriptor: int, data: memoryview, offset: int) -> int:
+    if hasattr(os, "pwrite"):
+        return os.pwrite(descriptor, data, offset)
+    with _POSITION_LOCK:
+        os.lseek(descriptor, offset, os.SEEK_SET)
+        return os.write(descriptor, data)
+
+
+def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> None:
+    """Lock an open file against other processes that do the same work, until it is
+    closed."""
+    busy = f"{os.fspath(path)}: another {work} is using it; wait for it, or write to another place"
+    if fcntl is None:
+        import msvcrt
+
+        with _POSITION_LOCK:
+            os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
+            try:
+                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+            except OSError:
+                raise RuntimeError(busy) from None
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RuntimeError(busy) from None
+    except OSError as error:
+        # Some network file systems have no locks; users must not start two builds with
+        # the same output there.
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise
+
+
+@contextlib.contextmanager
+def locked_folder(
+    folder: Path, path: str | os.PathLike[str], work: str = "build"
+) -> Iterator[None]:
+    """Lock a folder against other processes that do the same work. Errors name `path`.
+
+    Where folders cannot be opened, the lock is a file in the system's folder of
+    temporary files, so it holds against other processes of the same user.
+    """
+    if HAS_FOLDER_DESCRIPTORS:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | NO_LINK | PLAIN)
+    else:
+        name = os.path.normcase(os.path.realpath(folder))
+        digest = hashlib.blake2b(name.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()
+        lock_path = os.path.join(tempfile.gettempdir(), f"v3dg-{digest}.lock")
+        descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | PLAIN, 0o600)
+    try:
+        lock(descriptor, path, work)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def close_to_move(file: FileIO) -> None:
+    """Close a file that is moved or removed next, on systems that refuse to move open
+    files. The lock of the file ends."""
+    if fcntl is None:
+        file.close()
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:
@@ -192,9 +317,7 @@ def check_bundle_name(path: str | os.PathLike[str]) -> None:
 def open_regular(path: str | os.PathLike[str]) -> int:
     """Open a file for reading and return its descriptor; raise ValueError for a
     directory, a device or a pipe."""
-    # With O_NONBLOCK, opening a pipe does not wait for a writer. The flag has no effect
-    # on regular files.
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    descriptor = os.open(path, os.O_RDONLY | NO_WAIT | PLAIN)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise ValueError(f"{os.fspath(path)}: expected a file, got a directory, a device or a pipe")

@@ -2,8 +2,6 @@
 
 import contextlib
 import multiprocessing
-import os
-import signal
 import statistics
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -12,8 +10,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import NamedTuple, TypeVar, cast
 
+from v3dg import _system
 from v3dg._json import JsonObject
-from v3dg._start import SIGNALS
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -31,7 +29,7 @@ class Judges:
     and ended by `close`."""
 
     def __init__(self) -> None:
-        self._cores = len(os.sched_getaffinity(0))
+        self._cores = _system.num_processors()
         self._judges: list[_Judge] = []
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
@@ -65,7 +63,7 @@ class Judges:
             resource_tracker.ensure_running()  # starting the tracker unblocks signals
             # Only the parent process handles Ctrl-C. A new process must not be
             # interrupted before it can ignore the signal.
-            previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+            previous_mask = _system.block_signals(_system.SIGNALS)
             try:
                 # CUDA and OpenMP do not work in a forked process.
                 context = multiprocessing.get_context("spawn")
@@ -75,7 +73,7 @@ class Judges:
                 pipe_of_judge.close()
                 self._judges.append(_Judge(process, pipe))
             finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+                _system.set_blocked_signals(previous_mask)
         return self._judges[number].pipe
 
     def close(self) -> None:

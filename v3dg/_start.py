@@ -15,16 +15,12 @@ import importlib
 import os
 import sys
 
+from v3dg import _system
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     import types
     import weakref
-
-_AGAIN_AFTER_S = 0.02
-
-SIGNALS = (signal.SIGINT, signal.SIGALRM)
-"""The signals of Ctrl-C. The second one repeats an interrupt that could not be handled,
-for example during an import."""
 
 
 def refuse_sub_interpreter() -> None:
@@ -53,7 +49,7 @@ def begin() -> None:
     # If the parent process ignores Ctrl-C, this process ignores it, too.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_at_once)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    _system.unblock_signals({signal.SIGINT})
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         # The null device takes the closed descriptors from 0 to 2. Otherwise a file
         # that is opened later could get one of them, and output would be written to
@@ -81,7 +77,7 @@ def raise_interrupts() -> None:
     at once."""
     if signal.getsignal(signal.SIGINT) is _end_at_once:
         interrupts = _Interrupts()
-        for number in reversed(SIGNALS):
+        for number in reversed(_system.SIGNALS):
             signal.signal(number, interrupts.handle)
         sys.unraisablehook = interrupts.unraisable
 
@@ -104,8 +100,8 @@ class _Interrupts:
         # The interrupt is postponed in two cases: during an import, which would leave
         # an incomplete module, and while this thread blocks Ctrl-C but another thread
         # has received the signal.
-        if _is_importing(frame) or signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()):
-            signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
+        if _is_importing(frame) or signal.SIGINT in _system.block_signals(()):
+            _system.interrupt_soon()
         elif self._raised is None or self._raised() is None:
             raise self._interrupt()
 
@@ -121,7 +117,7 @@ class _Interrupts:
         callback."""
         if isinstance(arguments.exc_value, _Interrupt):
             self._raised = None
-            signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
+            _system.interrupt_soon()
         else:
             sys.__unraisablehook__(arguments)
 

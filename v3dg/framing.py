@@ -127,8 +127,8 @@ class Framing:
         elevation: float = DEFAULT_ELEVATION,
         azimuth: float = 0.0,
     ) -> Camera:
-        """Return the first camera for a picture of this size, which contains all of an
-        object for any aspect ratio.
+        """Return the camera of the first view, for a picture of ``width`` x ``height``
+        px. All of an object is in the picture, whatever the aspect ratio is.
 
         Args:
             up: (3,) direction in the world.

@@ -18,11 +18,12 @@ from v3dg.cameras import Camera, VectorLike, rigid
 from v3dg.image import Image
 from v3dg.pictures import MOST_SIDE
 
-# Tangents of half the field of view of a side (64 degrees), and of the angle beyond
-# which a side is blended with its neighbours.
+# Tangents of 32 degrees, which is half the field of view of a side, and of 18 degrees
+# from its middle, beyond which it is blended with its neighbours.
 _REACH = 0.625
 _UNBLENDED = 0.325
-# Number of pixels of a side for each pixel of the panorama, in the middle of the side.
+# In the middle of a side, its pixels are smaller than those of the panorama by this
+# factor.
 _DENSITY = 1.4
 _ROWS = 256  # number of rows that are resampled at once
 

@@ -95,10 +95,10 @@ def check_device(means: Array) -> None:
     """Raise an error unless tensors of this dtype can be drawn on their device."""
     if means.is_cuda and not _core.has_cuda:
         raise RuntimeError(
-            f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')"
+            f"gaussians: {_device.missing_for_cuda()}, or move the tensors to the CPU"
         )
     if means.is_cuda and str(means.dtype) == "torch.float64":
-        advice = "call gaussians.torch('cpu'), or use float32"
+        advice = "move the tensors to the CPU, or use float32"
         raise ValueError(f"gaussians: float64 is supported only on the CPU; {advice}")
 
 

@@ -8,7 +8,6 @@ GPU", lists the owners of all memory.
 
 import atexit
 import copy
-import os
 import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
@@ -18,7 +17,7 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _core
+from v3dg import _core, _system
 from v3dg._device import CPU, Device
 from v3dg._urls import is_url
 from v3dg.bundle import Bundle
@@ -163,7 +162,7 @@ class Residency:
         self.lock = threading.RLock()
         self._entries = weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, object]]()
         self._abandoned: list[object] = []
-        os.register_at_fork(after_in_child=self._after_fork)
+        _system.at_fork(in_child=self._after_fork)
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
         """Return the tables of a bundle's clusters, on the host, for selection and

@@ -2,8 +2,6 @@
 
 // Computes items ahead of time, on background threads.
 
-#include <omp.h>
-
 #include <cstddef>
 #include <cstdint>
 #include <exception>
@@ -13,12 +11,13 @@
 #include <vector>
 
 #include "base/mutex.h"
+#include "base/threads.h"
 
 namespace v3dg {
 
 // Computes items 0 to count - 1, which are used in this order. Thread i % num_threads
-// computes item i, with a single OpenMP thread. Item i occupies slot i % num_places
-// until it has been used.
+// computes item i, without further threads for parallel loops. Item i occupies slot
+// i % num_places until it has been used.
 class Ahead {
   public:
     Ahead(uint64_t count, unsigned num_threads, unsigned num_places,
@@ -56,7 +55,7 @@ class Ahead {
 
   private:
     void make_all(uint64_t first, unsigned num_threads) noexcept {
-        omp_set_num_threads(1);
+        use_one_thread();
         for (uint64_t i = first; i < count_; i += num_threads) {
             if (!wait_for_slot(i)) return;
             try {

@@ -3,29 +3,14 @@
 // Host memory that loses its contents when it grows. The counterpart on devices is
 // DeviceBuffer (device.h).
 
-#include <sys/mman.h>
-
-#include <cstdlib>
+#include <cstddef>
 #include <new>
 #include <utility>
 
+#include "base/host_memory.h"
 #include "base/span.h"
 
 namespace v3dg {
-
-// Returns memory that is aligned to a cache line, or null. Large blocks use huge pages
-// if the system supports them, because scattered reads would otherwise wait for the
-// page table.
-inline void* allocate_pages(size_t bytes) {
-    constexpr size_t kHugePage = size_t(2) << 20;
-    const size_t alignment = bytes < 2 * kHugePage ? 64 : kHugePage;
-    bytes = (bytes + alignment - 1) / alignment * alignment;
-    void* memory = std::aligned_alloc(alignment, bytes);
-#ifdef MADV_HUGEPAGE
-    if (memory != nullptr && alignment == kHugePage) madvise(memory, bytes, MADV_HUGEPAGE);
-#endif
-    return memory;
-}
 
 // An array of a plain type, not initialised. When it grows, the contents are lost.
 template <class T>
@@ -41,12 +26,12 @@ class Buffer {
         std::swap(capacity_, other.capacity_);
         return *this;
     }
-    ~Buffer() { std::free(data_); }
+    ~Buffer() { free_pages(data_); }
 
     // Makes room for `size` elements. Throws std::bad_alloc.
     T* reserve(size_t size) {
         if (size > capacity_) {
-            std::free(data_);
+            free_pages(data_);
             data_ = nullptr;
             capacity_ = 0;
             data_ = static_cast<T*>(allocate_pages(size * sizeof(T)));

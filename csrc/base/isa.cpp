@@ -7,6 +7,10 @@
 #include <stdexcept>
 #include <string>
 
+#if defined(_WIN32) && defined(__x86_64__)
+#include <intrin.h>
+#endif
+
 namespace v3dg {
 
 const char* isa_name(Isa isa) {
@@ -18,9 +22,35 @@ const char* isa_name(Isa isa) {
     return "baseline";
 }
 
-static Isa widest_isa() {
 #if defined(__x86_64__)
-    // The extensions that compilers use with -march=x86-64-v3 and -march=x86-64-v4.
+
+// The extensions that compilers use with -march=x86-64-v3 and -march=x86-64-v4.
+struct Extensions {
+    bool v3, v4;
+};
+
+#if defined(_WIN32)
+// Windows' C++ runtime lacks what __builtin_cpu_supports() reads. The operating system
+// must save the wide registers, too.
+__attribute__((target("xsave"))) static Extensions extensions() {
+    int basic[4], extended[4];
+    __cpuid(basic, 0);
+    if (basic[0] < 7) return {};
+    __cpuid(basic, 1);
+    __cpuidex(extended, 7, 0);
+    const auto has = [](int flags, int bit) {
+        return (static_cast<unsigned>(flags) >> bit & 1) != 0;
+    };
+    const bool has_xsave = has(basic[2], 27);
+    const unsigned long long saved = has_xsave ? _xgetbv(0) : 0;
+    const bool v3 = (saved & 0x6) == 0x6 && has(extended[1], 5) && has(basic[2], 12) &&
+                    has(extended[1], 3) && has(extended[1], 8) && has(basic[2], 23);
+    const bool v4 = v3 && (saved & 0xe6) == 0xe6 && has(extended[1], 16) && has(extended[1], 30) &&
+                    has(extended[1], 28) && has(extended[1], 17) && has(extended[1], 31);
+    return {v3, v4};
+}
+#else
+static Extensions extensions() {
     __builtin_cpu_init();
     const bool v3 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
                     __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&
@@ -28,11 +58,22 @@ static Isa widest_isa() {
     const bool v4 = v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
                     __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
                     __builtin_cpu_supports("avx512vl");
-    if (v4) return Isa::avx512;
-    if (v3) return Isa::avx2;
+    return {v3, v4};
+}
 #endif
+
+static Isa widest_isa() {
+    const Extensions present = extensions();
+    if (present.v4) return Isa::avx512;
+    if (present.v3) return Isa::avx2;
     return Isa::baseline;
 }
+
+#else
+
+static Isa widest_isa() { return Isa::baseline; }
+
+#endif
 
 static Isa choose_isa() {
     const Isa widest = widest_isa();

@@ -1,15 +1,31 @@
 #pragma once
 
 // The mutex, locks and condition variable of the standard library, with the annotations
-// of base/thread_annotations.h.
+// of base/thread_annotations.h. WebAssembly without threads has a mutex that does
+// nothing, and no condition variable.
 
+#if defined(__wasm__) && !defined(__wasm_atomics__)
+#define V3DG_HAS_THREADS 0
+#else
+#define V3DG_HAS_THREADS 1
 #include <chrono>
 #include <condition_variable>
+#endif
 #include <mutex>
 
 #include "base/thread_annotations.h"
 
 namespace v3dg {
+
+#if V3DG_HAS_THREADS
+using StandardMutex = std::mutex;
+#else
+struct StandardMutex {
+    void lock() {}
+    bool try_lock() { return true; }
+    void unlock() {}
+};
+#endif
 
 class V3DG_CAPABILITY("mutex") Mutex {
   public:
@@ -23,7 +39,7 @@ class V3DG_CAPABILITY("mutex") Mutex {
 
   private:
     friend class Condition;
-    std::mutex mutex_;
+    StandardMutex mutex_;
 };
 
 // Holds a mutex until the end of the scope.
@@ -53,6 +69,7 @@ class V3DG_SCOPED_CAPABILITY MutexUnlock {
     Mutex& mutex_;
 };
 
+#if V3DG_HAS_THREADS
 // A condition variable. Waits may end without a notification. There is no wait with a
 // predicate: callers test their condition in a loop, so that clang checks its accesses,
 // too.
@@ -78,5 +95,6 @@ class Condition {
   private:
     std::condition_variable condition_;
 };
+#endif
 
 }  // namespace v3dg

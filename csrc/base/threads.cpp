@@ -1,4 +1,6 @@
-// The largest number of threads that OpenMP can safely start.
+// The threads of parallel loops with OpenMP. thread_pool.cpp is used without it.
+
+#ifdef _OPENMP
 
 #include "base/threads.h"
 
@@ -53,4 +55,12 @@ int most_threads() {
     return std::min(omp_get_max_threads(), most);
 }
 
+int thread_index() { return omp_get_thread_num(); }
+
+bool is_in_parallel() { return omp_in_parallel() != 0; }
+
+void use_one_thread() { omp_set_num_threads(1); }
+
 }  // namespace v3dg
+
+#endif  // _OPENMP

@@ -208,8 +208,8 @@ class Frame {
 class AssetFrame {
   public:
     virtual ~AssetFrame() = default;
-    // Like Frame::draw(), for one camera. Unless draws_only_plainly, `sensor` may have
-    // channels and meshes.
+    // Like Frame::draw(), for one camera. The channel `clipped` is requested only if
+    // draws_only_plainly is false.
     virtual std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                                const SensorRequest& sensor,
                                                const std::atomic<bool>* stop) = 0;

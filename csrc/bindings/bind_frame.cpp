@@ -67,12 +67,12 @@ struct BoundLook {
 };
 
 // Returns the request for channels and meshes in pictures of these eyes. `sensor` is a
-// BoundSensor or None.
-SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes) {
+// BoundSensor or None; its mesh must be on the device.
+SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes, Device device) {
     if (sensor.is_none()) return {};
     const Window window = window_of(eyes.camera[0]);
     const SensorRequest request =
-        held<BoundSensor>(sensor, "sensor").request(kHost, {window.height(), window.width()});
+        held<BoundSensor>(sensor, "sensor").request(device, {window.height(), window.width()});
     if (request.mesh.is_there() && eyes.are_two)
         throw py::value_error("mesh: expected one camera, got two eyes; draw each eye separately");
     if (request.channels.clipped && !eyes.camera[0].is_pinhole())
@@ -101,7 +101,7 @@ struct BoundRequest {
           cluster_colors(look == nullptr ? py::object() : py::object(look->cluster_colors)),
           sensor(std::move(channels)) {
         check_footprint(plain.eyes, plain.rule);
-        plain.sensor = sensor_of(sensor, plain.eyes);
+        plain.sensor = sensor_of(sensor, plain.eyes, kHost);
         if (given != nullptr && plain.eyes.are_two)
             throw py::value_error(
                 "cut: expected one camera, got two eyes; draw each eye separately");
@@ -133,11 +133,13 @@ struct BoundRequest {
     }
 };
 
-// Throws ValueError if the device cannot draw channels and meshes, but is asked to.
+// Throws ValueError if the device cannot draw channels and meshes of scenes, or the
+// channel `clipped`, but is asked to.
 void check_sensor(Device device, const SensorRequest& sensor) {
     if (sensor.is_on() && backend_of(device).traits.draws_only_plainly)
         throw py::value_error(
-            "channels, mesh: supported only on the CPU so far; draw with device='cpu'");
+            "channels, mesh: for scenes, and 'clipped' for assets, supported only on the CPU so "
+            "far; draw with device='cpu'");
 }
 
 // Draws scenes on one device. The frame's models belong to the bundles of the scenes,
@@ -356,8 +358,8 @@ class BoundAssetFrame {
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
                                        const Stop* stop, const py::object& sensor_object) {
-        const SensorRequest sensor = sensor_of(sensor_object, camera.camera);
-        check_sensor(device_, sensor);
+        const SensorRequest sensor = sensor_of(sensor_object, camera.camera, device_);
+        if (sensor.channels.clipped) check_sensor(device_, sensor);
         std::unique_ptr<BoundDrawing> drawing =
             frame_->draw(camera.camera, shade, sensor, flag_of(stop));
         if (drawing->is_under_way()) drawing->keep(py::cast(this));

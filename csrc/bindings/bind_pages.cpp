@@ -80,7 +80,7 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
                                   " bytes for a page, got " + std::to_string(run.num_bytes(page)));
     }
     naming_file(path, [&] {
-        const PosixFile file = PosixFile::duplicate(descriptor);
+        const File file = File::duplicate(descriptor);
         read_pages(file, run, codec, rows);
     });
 }
@@ -92,7 +92,7 @@ void read_words(const py::object& path, int descriptor, const PageRun& run, cons
                               std::to_string(num_bytes));
     const Span<int32_t> words =
         span_of<int32_t>(out, "out", {static_cast<py::ssize_t>(num_bytes / 4)});
-    naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, words); });
+    naming_file(path, [&] { read_codes(File::duplicate(descriptor), run, words); });
 }
 
 // Reads a range of pages to `out`. If `out` is Rows, it receives decoded gaussians. If
@@ -129,7 +129,7 @@ class BoundHashedRead {
         : path_(path), message_(std::move(message)), offset_(offset), num_before_(num_before) {
         const Span<uint8_t> bytes = span_of<uint8_t>(message_, "message", {-1});
         naming_file(path_, [&] {
-            read_.emplace(PosixFile::duplicate(descriptor), offset, bytes, num_before, how);
+            read_.emplace(File::duplicate(descriptor), offset, bytes, num_before, how);
         });
     }
     py::array wait();

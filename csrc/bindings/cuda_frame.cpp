@@ -4,7 +4,7 @@
 
 #include "bindings/cuda_frame.h"
 
-#include "draw/render_backward_cuda.h"
+#include "draw/sensing_frame_cuda.h"
 
 namespace v3dg::cuda {
 
@@ -345,9 +345,11 @@ class BackendAssetFrame final : public backend::AssetFrame {
         : device_(device), model_(std::move(model)), appearance_(appearance) {}
 
     std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
-                                       const SensorRequest&, const std::atomic<bool>*) override {
+                                       const SensorRequest& sensor,
+                                       const std::atomic<bool>*) override {
         const Turn turn(*turns_);
         const Work work(device_);
+        if (sensor.is_on()) return draw_sensed(camera, shade, sensor, work);
         NewPictures pictures;
         const EyeImages images = new_images(camera, shade, pictures);
         const PackedModel& packed = *static_cast<const BackendModel&>(*model_).on_device().packed;
@@ -360,11 +362,36 @@ class BackendAssetFrame final : public backend::AssetFrame {
     }
 
   private:
+    // Draws with channels and meshes. Waits.
+    std::unique_ptr<BoundDrawing> draw_sensed(const Camera& camera, const Shade& shade,
+                                              const SensorRequest& sensor, const Work& work)
+        V3DG_REQUIRES(*turns_) {
+        NewPictures pictures;
+        const EyeImages images = new_images(camera, shade, pictures);
+        ModelPicture picture{
+            .rows = static_cast<const BackendModel&>(*model_).on_device().packed->rows(),
+            .view = view_of_world<float>(camera),
+            .filter_px2 = appearance_.filter_px2,
+            .antialiased = appearance_.antialiased,
+            .image = images.image[0]};
+        picture.image.planes = planes_of(pictures[0], device_);
+        const SensorPlanes channels = pictures[0].channels.allocate(
+            device_, sensor.channels, {pictures[0].height, pictures[0].width});
+        if (sensing_ == nullptr) sensing_ = std::make_unique<SensingFrame>();
+        std::unique_ptr<Drawing> drawing =
+            sensing_->draw(picture, images.min_transmittance,
+                           {.planes = channels, .mesh = sensor.mesh}, stream_of(work));
+        return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
+                                                 std::move(drawing), SelectRule{}, nullptr);
+    }
+
     const Device device_;
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
     const std::shared_ptr<const backend::Model> model_;
     const Appearance<float> appearance_;
     ModelFrame frame_ V3DG_GUARDED_BY(*turns_);
+    // The frame of pictures with channels; made when it is needed.
+    std::unique_ptr<SensingFrame> sensing_ V3DG_GUARDED_BY(*turns_);
 };
 
 class DeviceTape final : public Tape {

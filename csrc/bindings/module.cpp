@@ -1,20 +1,22 @@
 // The definition of the compiled module: what it requires of the process, then the
 // bindings of each part.
 
+#ifdef _OPENMP
 #include <dlfcn.h>
 #include <omp.h>
-#include <pthread.h>
 
 #include <cstring>
-#include <new>
+#endif
 
 #include "base/isa.h"
+#include "base/process.h"
 #include "bindings/backend.h"
 #include "bindings/operations.h"
 #include "bindings/python_lock.h"
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
+#ifdef _OPENMP
 // Ends the idle threads of GNU's OpenMP (libgomp) before a fork(). The child would have
 // no such threads, but would wait for them for ever. The next parallel loop starts new
 // threads, in the parent as in the child. LLVM's OpenMP, which may replace libgomp,
@@ -26,6 +28,7 @@ static bool must_let_threads_go() {
     return dladdr(reinterpret_cast<void*>(&omp_pause_resource_all), &found) != 0 &&
            std::strstr(found.dli_fname, "libgomp") != nullptr;
 }
+#endif
 
 static int num_cuda_devices() {
     const v3dg::Backend* const backend = v3dg::device_backend();
@@ -49,8 +52,9 @@ static void refuse_unmade_objects(const v3dg::py::module_& m) {
 }
 
 PYBIND11_MODULE(_core, m) {
-    if (must_let_threads_go() && pthread_atfork(&let_threads_go, nullptr, nullptr) != 0)
-        throw std::bad_alloc();
+#ifdef _OPENMP
+    if (must_let_threads_go()) v3dg::at_fork(&let_threads_go, nullptr);
+#endif
     v3dg::watch_end_of_python();
     m.doc() = "The compiled operations of v3dg. The package v3dg is the public interface.";
     m.attr("min_alpha") = v3dg::kMinAlpha;
@@ -59,6 +63,11 @@ PYBIND11_MODULE(_core, m) {
     m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
     m.attr("sh_base0") = v3dg::kShBase0;
     m.attr("has_cuda") = v3dg::device_backend() != nullptr;
+#ifdef _OPENMP
+    m.attr("has_openmp") = true;
+#else
+    m.attr("has_openmp") = false;
+#endif
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
         "The instruction set that operations on the CPU use.");

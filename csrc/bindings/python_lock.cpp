@@ -1,10 +1,9 @@
 #include "bindings/python_lock.h"
 
-#include <pthread.h>
-#include <unistd.h>
-
 #include <mutex>
 #include <new>
+
+#include "base/process.h"
 
 namespace v3dg {
 
@@ -39,10 +38,6 @@ void renew_entrance() { new (&entrance().busy) std::mutex; }
 
 }  // namespace
 
-void sleep_for_ever() noexcept {
-    for (;;) pause();
-}
-
 bool call_with_lock(const std::function<void()>& body) {
     PyGILState_STATE state{};
     const bool is_open = staying_if_ended([&] {
@@ -64,7 +59,7 @@ bool call_with_lock(const std::function<void()>& body) {
 }
 
 void watch_end_of_python() {
-    if (pthread_atfork(nullptr, nullptr, &renew_entrance) != 0) throw std::bad_alloc();
+    at_fork(nullptr, &renew_entrance);
     py::module_::import("atexit").attr("register")(py::cpp_function(&close_entrance));
 }
 

@@ -9,25 +9,32 @@
 // without the GIL. Therefore such a thread never returns to this code: it sleeps until
 // the process ends, which does not wait for it. Python 3.14 and later do the same.
 
-#include <cxxabi.h>
 #include <pybind11/pybind11.h>
 
 #include <functional>
 
+#ifdef __GLIBCXX__
+#include <cxxabi.h>
+
+#include "base/process.h"
+#endif
+
 namespace v3dg {
 
-// Sleeps until the process ends.
-[[noreturn]] void sleep_for_ever() noexcept;
-
 // Calls body(), during which Python may end the thread. Objects on the stack between
-// this call and Python must not have destructors that need the GIL.
+// this call and Python must not have destructors that need the GIL. Only GNU's C++
+// library unwinds the stack of a thread that ends.
 template <class Body>
 auto staying_if_ended(const Body& body) {
+#ifdef __GLIBCXX__
     try {
         return body();
     } catch (abi::__forced_unwind&) {
         sleep_for_ever();
     }
+#else
+    return body();
+#endif
 }
 
 // Releases the GIL during its lifetime.

@@ -53,7 +53,7 @@ class OpenBundle::File {
     File(const File&) = delete;
     ~File() { ::close(descriptor_); }
     int descriptor() const { return descriptor_; }
-    PosixFile duplicate() const { return PosixFile::duplicate(descriptor_); }
+    v3dg::File duplicate() const { return v3dg::File::duplicate(descriptor_); }
 
     std::optional<HashedRead> tables;
 
@@ -66,10 +66,9 @@ OpenBundle::OpenBundle(const std::string& path) {
     const auto fail = [&](const std::string& problem) {
         throw Fault(V3DG_ERROR_FILE, path + ": " + problem);
     };
-    const PosixFile reader = file.duplicate();
-    const struct stat status = reader.status();
-    if (!S_ISREG(status.st_mode)) fail("expected a file, got a directory, a device or a pipe");
-    const auto num_bytes = static_cast<uint64_t>(status.st_size);
+    const v3dg::File reader = file.duplicate();
+    if (!reader.is_regular()) fail("expected a file, got a directory, a device or a pipe");
+    const uint64_t num_bytes = reader.size();
     if (num_bytes < 8)
         fail("expected a bundle, got a file of only " + std::to_string(num_bytes) + " bytes");
     if (num_bytes >= kMostFileBytes) fail("size: expected less than 2^48 bytes, got more");

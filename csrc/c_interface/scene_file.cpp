@@ -20,7 +20,7 @@
 #include "c_interface/cameras.h"
 #include "c_interface/json_node.h"
 #include "c_interface/placing.h"
-#include "io/posix_file.h"
+#include "io/file.h"
 
 namespace v3dg {
 
@@ -37,12 +37,11 @@ using SharedScene = std::shared_ptr<const SceneContent>;
 
 std::string read_text(const std::string& path) {
     try {
-        const PosixFile file = PosixFile::open(path.c_str());
-        const struct stat status = file.status();
-        if (!S_ISREG(status.st_mode))
+        const v3dg::File file = v3dg::File::open(path.c_str());
+        if (!file.is_regular())
             throw Fault(V3DG_ERROR_FILE,
                         path + ": expected a file, got a directory, a device or a pipe");
-        std::string text(static_cast<size_t>(status.st_size), '\0');
+        std::string text(file.size(), '\0');
         text.resize(file.read_at(0, text.data(), text.size()));
         return text;
     } catch (const std::system_error& error) {

@@ -1,8 +1,7 @@
-// Clustering on the CPU. The median split processes segments in parallel, and starts a
-// task per node, down to a size at which tasks cost more than they gain. A bounding
-// ball is computed by one thread.
+// Clustering on the CPU. The median split halves all large nodes of a level in
+// parallel, then those of the next level; one thread splits a small node down to its
+// leaves. A bounding ball is computed by one thread.
 
-#include "base/threads.h"
 #include "cluster/cluster.h"
 
 #include <algorithm>
@@ -37,7 +36,16 @@ struct IndexedPoint {
     uint32_t index;
 };
 
+// Nodes of at most this many points are split by one thread.
 constexpr ptrdiff_t kTaskSize = 16384;
+
+// The points of a node, which has 2^depth leaves.
+struct Node {
+    ptrdiff_t first = 0, last = 0;
+    int depth = 0;
+
+    ptrdiff_t size() const { return last - first; }
+};
 
 int longest_axis(const IndexedPoint* first, const IndexedPoint* last) {
     float lo[3], hi[3];
@@ -60,26 +68,47 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
     });
 }
 
-// Splits points `first` to `last` into the 2^depth leaves of a node. All arguments are
-// plain values: LLVM's OpenMP, which the thread sanitizer requires (.ci/sanitize), does
-// not copy other types into a task that runs immediately.
-void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, size_t unit,
-                int64_t* order) {
-    if (depth == 0) {
-        for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
-        std::sort(order + first, order + last);
+// Moves the lower half of a node's points to its front. Returns the end of that half.
+ptrdiff_t halve_node(IndexedPoint* points, const Node& node, size_t unit) {
+    const auto size = static_cast<size_t>(node.size());
+    const ptrdiff_t middle = node.first + static_cast<ptrdiff_t>(left_half(size, unit));
+    if (middle < node.last) {
+        const int axis = longest_axis(points + node.first, points + node.last);
+        const auto move = axis == 0 ? move_median<0> : axis == 1 ? move_median<1> : move_median<2>;
+        move(points + node.first, points + middle, points + node.last);
+    }
+    return middle;
+}
+
+// Splits a node into its leaves.
+void split_node(IndexedPoint* points, const Node& node, size_t unit, int64_t* order) {
+    if (node.depth == 0) {
+        for (ptrdiff_t i = node.first; i < node.last; ++i) order[i] = points[i].index;
+        std::sort(order + node.first, order + node.last);
         return;
     }
-    const ptrdiff_t middle =
-        first + static_cast<ptrdiff_t>(left_half(static_cast<size_t>(last - first), unit));
-    if (middle < last) {
-        const int axis = longest_axis(points + first, points + last);
-        const auto move = axis == 0 ? move_median<0> : axis == 1 ? move_median<1> : move_median<2>;
-        move(points + first, points + middle, points + last);
-    }
-#pragma omp task if (last - first > kTaskSize)
-    split_node(points, first, middle, depth - 1, unit, order);
-    split_node(points, middle, last, depth - 1, unit, order);
+    const ptrdiff_t middle = halve_node(points, node, unit);
+    split_node(points, {node.first, middle, node.depth - 1}, unit, order);
+    split_node(points, {middle, node.last, node.depth - 1}, unit, order);
+}
+
+// Splits small nodes into their leaves, and large ones into two nodes, which it
+// returns.
+std::vector<Node> split_level(IndexedPoint* points, const std::vector<Node>& nodes, size_t unit,
+                              int64_t* order) {
+    std::vector<Node> halves(2 * nodes.size());
+    parallel_for(nodes.size(), 1, [&](size_t n) {
+        const Node& node = nodes[n];
+        if (node.depth == 0 || node.size() <= kTaskSize) {
+            split_node(points, node, unit, order);
+            return;
+        }
+        const ptrdiff_t middle = halve_node(points, node, unit);
+        halves[2 * n] = {node.first, middle, node.depth - 1};
+        halves[2 * n + 1] = {middle, node.last, node.depth - 1};
+    });
+    std::erase_if(halves, [](const Node& node) { return node.size() == 0; });
+    return halves;
 }
 
 size_t farthest(const Center& center, const Ball* spheres, size_t count, double* distance) {
@@ -142,17 +171,12 @@ void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int 
     assert(order.size == means.size);
     halve_segments(offset, depth, unit, leaf_offset);
     std::vector<IndexedPoint> points(means.size);
-    const ptrdiff_t count = static_cast<ptrdiff_t>(means.size);
-    const ptrdiff_t num_segments = static_cast<ptrdiff_t>(offset.size) - 1;
-#pragma omp parallel if (count > kTaskSize) num_threads(most_threads())
-    {
-#pragma omp for
-        for (ptrdiff_t i = 0; i < count; ++i)
-            points[i] = {{means[i].axis[0], means[i].axis[1], means[i].axis[2]}, uint32_t(i)};
-#pragma omp for schedule(dynamic, 1)
-        for (ptrdiff_t s = 0; s < num_segments; ++s)
-            split_node(points.data(), offset[s], offset[s + 1], depth, unit, order.data);
-    }
+    parallel_for(means.size, kTaskSize, [&](size_t i) {
+        points[i] = {{means[i].axis[0], means[i].axis[1], means[i].axis[2]}, uint32_t(i)};
+    });
+    std::vector<Node> nodes;
+    for (size_t s = 0; s + 1 < offset.size; ++s) nodes.push_back({offset[s], offset[s + 1], depth});
+    while (!nodes.empty()) nodes = split_level(points.data(), nodes, unit, order.data);
 }
 
 void cpu::bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,

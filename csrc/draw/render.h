@@ -22,6 +22,8 @@ struct Workspace {
     Buffer<uint64_t> chunk_first;
     Buffer<uint32_t> chunk_count;
     TileLists lists;
+    GrowingLists growing;      // instead of `lists`, if one thread draws few gaussians
+    Buffer<uint64_t> scratch;  // for sorting a list of `growing`
     size_t num_chunks = 0;
     uint64_t room = 0;  // length of the used part of `records`, including gaps
     // Largest `room` so far, and thus the memory that was ever touched.

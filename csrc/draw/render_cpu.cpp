@@ -1,11 +1,8 @@
 // Draws pictures on the CPU, and computes gradients: the gaussians are projected and
 // binned in parallel pieces, and tiles are blended in parallel.
 
-#include "base/threads.h"
 #include "draw/render.h"
 #include "draw/sense.h"
-
-#include <omp.h>
 
 #include <algorithm>
 #include <atomic>
@@ -96,13 +93,13 @@ class RecordRoom {
     uint64_t used() const { return used_; }
     // Returns the index of the first record of this thread's next chunk.
     uint64_t take() {
-        Strip& mine = mine_[omp_get_thread_num()];
+        Strip& mine = mine_[thread_index()];
         if (mine.left < longest_)
             mine = {used_.fetch_add(strip_, std::memory_order_relaxed), strip_};
         return mine.next;
     }
     void keep(uint64_t count) {
-        Strip& mine = mine_[omp_get_thread_num()];
+        Strip& mine = mine_[thread_index()];
         mine.next += count;
         mine.left -= count;
     }
@@ -115,6 +112,23 @@ class RecordRoom {
     std::atomic<uint64_t> used_{0};
     std::vector<Strip> mine_;
 };
+
+// Returns the gaussians that are projected after piece p, up to piece `last`.
+template <class T>
+static NextRun<T> run_after(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
+                            size_t p, size_t last) {
+    if (p + 1 >= last) return {};
+    const Draw<T>& draw = draws[pieces[p + 1].draw];
+    return {.model = draw.codes == nullptr ? draw.model : nullptr,
+            .first = draw.first + pieces[p + 1].skip};
+}
+
+// Returns whether loops of this thread are not divided among threads.
+static bool runs_alone() { return most_threads() == 1 || omp_in_parallel() != 0; }
+
+static uint64_t num_gaussians_of(const std::vector<Piece>& pieces) {
+    return pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
+}
 
 // Returns the tiles in falling order of the length of their lists, so that no thread
 // starts a long list at the end.
@@ -134,7 +148,7 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
-    if (stop != nullptr || omp_in_parallel() != 0) return kLeastBandBytes;
+    if (stop != nullptr || is_in_parallel()) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
 // Pictures with at most this many gaussians are drawn in a single band, because they
@@ -217,7 +231,8 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
             count += V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count,
                                        camera, window, records + first + count,
                                        keep_source ? source + first + count : nullptr,
-                                       static_cast<uint32_t>(piece.first), reach);
+                                       static_cast<uint32_t>(piece.first), reach,
+                                       run_after(draws, pieces, p, chunks[c].last));
             piece.reach = reach;
         }
         if (is_stopped(stop)) return;
@@ -242,8 +257,7 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
         const uint32_t t = order[i];
         uint64_t* entry = ws.lists.entry.data() + offset[t];
         const size_t count = offset[t + 1] - offset[t];
-        sort_tile(records, ws.lists.format, entry, count,
-                  scratch[omp_get_thread_num()].reserve(count));
+        sort_tile(records, ws.lists.format, entry, count, scratch[thread_index()].reserve(count));
         V3DG_DISPATCH_ISA(rasterize_tile<T>, records, ws.lists.format, entry, count,
                           kTileSize * grid.column(t), kTileSize * grid.row(t), picture);
     });
@@ -251,6 +265,40 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     counts.project_seconds += projected - start;
     counts.bin_seconds += binned - projected;
     counts.rasterize_seconds += now() - binned;
+}
+
+// Draws a picture of at most kMostChunkRecords gaussians on one thread, so that records
+// are in one sequence, and entries go straight to the lists of their tiles.
+template <class T>
+static void render_alone(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
+                         const Intrinsics<T>& camera, const Picture<T>& picture, Workspace<T>& ws,
+                         const std::atomic<bool>* stop, RenderCounts& counts) {
+    const double start = now();
+    const TileGrid grid(picture.window);
+    ws.room = num_gaussians_of(pieces);
+    ws.most_room = std::max(ws.most_room, ws.room);
+    Record<T>* records = ws.records.reserve(ws.room);
+    ws.growing.start(grid);
+    uint32_t num_records = 0;
+    for (size_t p = 0; p < pieces.size() && !is_stopped(stop); ++p) {
+        Piece& piece = pieces[p];
+        const auto count = static_cast<uint32_t>(
+            V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count, camera,
+                              picture.window, records + num_records, nullptr, 0, piece.reach,
+                              run_after(draws, pieces, p, pieces.size())));
+        append_records(records, num_records, count, grid, ws.growing);
+        num_records += count;
+    }
+    const double projected = now();
+    for (size_t t = 0; t < grid.size() && !is_stopped(stop); ++t) {
+        const GrowingLists::List& list = ws.growing.list[t];
+        sort_tile(records, kChunkFormat, list.data(), list.size(), ws.scratch.reserve(list.size()));
+        V3DG_DISPATCH_ISA(rasterize_tile<T>, records, kChunkFormat, list.data(), list.size(),
+                          kTileSize * grid.column(t), kTileSize * grid.row(t), picture);
+        counts.entries += list.size();
+    }
+    counts.project_seconds += projected - start;
+    counts.rasterize_seconds += now() - projected;
 }
 
 // Returns the part of a picture that is in a band.
@@ -288,7 +336,10 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Intrinsics<T>& came
     const std::vector<Window> bands = keep_source
                                           ? std::vector<Window>{picture.window}
                                           : bands_of(draws, pieces, camera, picture.window, stop);
-    for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b) {
+    const bool is_alone = !keep_source && sensor == nullptr && bands.size() == 1 && runs_alone() &&
+                          num_gaussians_of(pieces) <= kMostChunkRecords;
+    if (is_alone) render_alone(draws, pieces, camera, picture, ws, stop, counts);
+    for (size_t b = 0; b < bands.size() && !is_alone && !is_stopped(stop); ++b) {
         render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), needs_source, ws,
                     stop, counts);
         if constexpr (std::is_same_v<T, float>)
@@ -337,9 +388,9 @@ void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Pic
         const uint32_t t = order[i];
         const size_t count = offset[t + 1] - offset[t];
         const int column = grid.column(t), row = grid.row(t);
-        std::vector<RecordGradient<T>>& d_entry = d_entries[omp_get_thread_num()];
+        std::vector<RecordGradient<T>>& d_entry = d_entries[thread_index()];
         d_entry.assign(count, RecordGradient<T>{});
-        std::vector<CenterSize<T>>& size = sizes[omp_get_thread_num()];
+        std::vector<CenterSize<T>>& size = sizes[thread_index()];
         size.assign(with_size ? count : 0, CenterSize<T>{});
         V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, ws.lists.format, entry + offset[t],
                           count, kTileSize * column, kTileSize * row, picture, d_picture,

@@ -8,8 +8,6 @@
 #include <stdexcept>
 #include <string>
 
-#include <omp.h>
-
 #include "base/clock.h"
 #include "base/parallel_for.h"
 #include "draw/false_color.h"
@@ -414,7 +412,7 @@ void cpu::draw_batch(const HostScene& scene, const BatchRequest& request,
     std::vector<Workspace<float>> workspaces(std::min(count, num_threads));
     const auto draw = [&](size_t k) {
         // A nested parallel loop has one thread, whose number is 0.
-        Workspace<float>& workspace = workspaces[omp_get_thread_num()];
+        Workspace<float>& workspace = workspaces[thread_index()];
         counts[k] = draw_picture(shared, request, cameras, k, workspace);
     };
     parallel_for(num_spread, 1, draw);

@@ -15,7 +15,7 @@ struct Record {
     T color[3];
     T depth;
     // The first and last column and row of pixels whose centres the gaussian can reach,
-    // clipped to the image or the window.
+    // clipped to the image, or to its part that is drawn (Window in frame/image.h).
     uint16_t x0, x1, y0, y1;
 };
 

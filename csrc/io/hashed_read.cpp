@@ -14,7 +14,7 @@ constexpr size_t kNeededBefore = size_t(64) << 10;
 
 }  // namespace
 
-HashedRead::HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
+HashedRead::HashedRead(File file, size_t offset, Span<uint8_t> message, size_t num_before,
                        HashOf hash_of)
     : file_(std::move(file)),
       offset_(offset),

@@ -7,7 +7,7 @@
 #include "base/mutex.h"
 #include "base/span.h"
 #include "io/blake2b.h"
-#include "io/posix_file.h"
+#include "io/file.h"
 
 namespace v3dg {
 
@@ -25,8 +25,7 @@ class HashedRead {
     // start at `offset`. The caller has filled the bytes before; they are hashed, too.
     // The last bytes of the message are the hash of all preceding bytes. The memory of
     // the message must outlive this object.
-    HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
-               HashOf hash_of);
+    HashedRead(File file, size_t offset, Span<uint8_t> message, size_t num_before, HashOf hash_of);
     HashedRead(const HashedRead&) = delete;
 
     // Waits until everything is read. Returns false if the file ended early. Throws
@@ -42,7 +41,7 @@ class HashedRead {
     void report(size_t num_read, bool is_over) V3DG_EXCLUDES(busy_);
     size_t wait_for_more(size_t num_known) V3DG_EXCLUDES(busy_);
 
-    const PosixFile file_;
+    const File file_;
     const size_t offset_;
     const Span<uint8_t> bytes_;          // memory to read to
     const Span<const uint8_t> message_;  // bytes to hash

@@ -16,8 +16,8 @@
 #include <vector>
 
 #include "base/span.h"
+#include "io/file.h"
 #include "io/ply_header.h"
-#include "io/posix_file.h"
 
 namespace v3dg {
 
@@ -64,7 +64,7 @@ struct PlyLayout {
 // An open file. Its header was checked, and the sizes in it were compared with the size
 // of the file.
 struct PlyFile {
-    PosixFile file;
+    File file;
     size_t file_bytes;
     PlyEncoding encoding;
     PlyElement vertex;

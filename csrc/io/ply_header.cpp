@@ -156,15 +156,14 @@ std::string quoted(const std::string& text) {
     return "'" + shown + (text.size() > kMaxLength ? "..." : "") + "'";
 }
 
-PosixFile open_ply_file(const char* path) {
-    PosixFile file = PosixFile::open(path);
-    const struct stat status = file.status();
-    if (S_ISDIR(status.st_mode)) throw std::system_error(EISDIR, std::generic_category());
-    if (!S_ISREG(status.st_mode)) throw PlyError("expected a regular file, got a device or a pipe");
+File open_ply_file(const char* path) {
+    File file = File::open(path);
+    if (file.is_folder()) throw std::system_error(EISDIR, std::generic_category());
+    if (!file.is_regular()) throw PlyError("expected a regular file, got a device or a pipe");
     return file;
 }
 
-PlyHeader read_ply_header(const PosixFile& file) {
+PlyHeader read_ply_header(const File& file) {
     HeaderParser parser;
     std::string text;
     size_t line_begin = 0;

@@ -8,7 +8,7 @@
 #include <string>
 #include <vector>
 
-#include "io/posix_file.h"
+#include "io/file.h"
 
 namespace v3dg {
 
@@ -69,11 +69,11 @@ struct PlyHeader {
 
 // Opens a file. Throws std::system_error if it cannot be opened, and PlyError if it is
 // not a regular file.
-PosixFile open_ply_file(const char* path);
+File open_ply_file(const char* path);
 
 // Reads and checks the header. Does not compare it with the size of the file. Throws
 // PlyError.
-PlyHeader read_ply_header(const PosixFile& file);
+PlyHeader read_ply_header(const File& file);
 
 // Returns `text` in quotes, shortened and printable, for an error text.
 std::string quoted(const std::string& text);

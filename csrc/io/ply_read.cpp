@@ -44,8 +44,8 @@ size_t skip_element(const PlyFile& ply, const PlyElement& element, size_t offset
 }  // namespace
 
 PlyFile open_ply(const char* path) {
-    PosixFile file = open_ply_file(path);
-    const auto size = static_cast<size_t>(file.status().st_size);
+    File file = open_ply_file(path);
+    const size_t size = file.size();
     const PlyHeader header = read_ply_header(file);
     PlyFile ply = {.file = std::move(file),
                    .file_bytes = size,

@@ -12,10 +12,7 @@
 #include <string>
 #include <vector>
 
-#include <omp.h>
-
-#include "base/first_error.h"
-#include "base/threads.h"
+#include "base/parallel_for.h"
 #include "io/ply_fields.h"
 
 namespace v3dg {
@@ -25,6 +22,8 @@ namespace {
 // The bytes that a thread reads and converts at once. They fit into the cache of a
 // core.
 constexpr size_t kBlockBytes = size_t(1) << 18;
+// The rows that a thread converts at once, if one thread reads the rows of a file.
+constexpr size_t kRowsPerTask = 256;
 
 template <class T>
 T load_as(const char* bytes, bool is_swapped) {
@@ -116,7 +115,7 @@ class RowDecoder {
 // Reads a file in ascending order.
 class ByteReader {
   public:
-    ByteReader(const PosixFile& file, size_t offset, size_t file_bytes)
+    ByteReader(const File& file, size_t offset, size_t file_bytes)
         : file_(file),
           offset_(offset),
           file_bytes_(file_bytes),
@@ -145,7 +144,7 @@ class ByteReader {
     }
 
   private:
-    const PosixFile& file_;
+    const File& file_;
     size_t offset_;
     size_t file_bytes_;
     std::vector<char> buffer_;
@@ -189,20 +188,15 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<
     // new char[] does not initialise the memory, so that a thread without a block
     // touches none.
     const std::unique_ptr<char[]> buffers(new char[num_threads * block_rows * row_bytes]);
-    FirstError error;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(num_threads)
-    for (size_t block = 0; block < num_blocks; ++block) {
-        error.run(block, [&] {
-            char* rows = buffers.get() + omp_get_thread_num() * block_rows * row_bytes;
-            const size_t first = block * block_rows;
-            const size_t count = std::min(block_rows, num_rows - first);
-            const size_t size = count * row_bytes;
-            if (ply.file.read_at(begin.offset + first * row_bytes, rows, size) != size)
-                throw PlyError("the file became shorter while it was read; read it again");
-            decoder.decode(rows, count, first);
-        });
-    }
-    error.rethrow();
+    parallel_for_on(num_threads, num_blocks, 1, [&](size_t block) {
+        char* rows = buffers.get() + thread_index() * block_rows * row_bytes;
+        const size_t first = block * block_rows;
+        const size_t count = std::min(block_rows, num_rows - first);
+        const size_t size = count * row_bytes;
+        if (ply.file.read_at(begin.offset + first * row_bytes, rows, size) != size)
+            throw PlyError("the file became shorter while it was read; read it again");
+        decoder.decode(rows, count, first);
+    });
     return {begin.row + num_rows, begin.offset + num_rows * row_bytes};
 }
 
@@ -218,9 +212,9 @@ PlyPlace read_rows_with_lists(const PlyFile& ply, PlyPlace begin, const PlyGauss
         for (size_t r = 0; r < count; ++r)
             walk_row(reader, ply.vertex, begin.row + first + r, is_swapped(ply.encoding),
                      packed.data() + r * row_bytes);
-#pragma omp parallel for schedule(static) num_threads(most_threads())
-        for (size_t r = 0; r < count; ++r)
+        parallel_for(count, kRowsPerTask, [&](size_t r) {
             decoder.decode(packed.data() + r * row_bytes, 1, first + r);
+        });
     }
     return {begin.row + num_rows, reader.offset()};
 }

@@ -11,10 +11,7 @@
 #include <string>
 #include <vector>
 
-#include <omp.h>
-
-#include "base/first_error.h"
-#include "base/threads.h"
+#include "base/parallel_for.h"
 #include "io/ply_fields.h"
 
 namespace v3dg {
@@ -33,7 +30,7 @@ class LineReader {
   public:
     // The buffer has room for one byte more than the rest of the file, so that reading
     // detects the end of the file.
-    LineReader(const PosixFile& file, size_t offset, size_t file_bytes)
+    LineReader(const File& file, size_t offset, size_t file_bytes)
         : file_(file),
           offset_(offset),
           buffer_(std::min(kPlyChunkBytes, file_bytes - std::min(offset, file_bytes) + 1)) {}
@@ -77,7 +74,7 @@ class LineReader {
         }
     }
 
-    const PosixFile& file_;
+    const File& file_;
     size_t offset_;  // offset of the end of the buffer
     std::vector<char> buffer_;
     size_t begin_ = 0;
@@ -174,17 +171,12 @@ PlyPlace read_text(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>
     for (size_t first = 0; first < num_rows;) {
         const std::vector<Line>& lines = reader.next(num_rows - first);
         if (lines.empty()) throw_too_few(ply.vertex, begin.row + first);
-        FirstError error;
-#pragma omp parallel for schedule(dynamic, kLinesPerTask) num_threads(most_threads())
-        for (size_t r = 0; r < lines.size(); ++r) {
-            error.run(r, [&] {
-                double* row = values.data() + omp_get_thread_num() * num_properties;
-                parse_row(lines[r], begin.row + first + r, ply.vertex, row);
-                store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r,
-                               ply.layout, out);
-            });
-        }
-        error.rethrow();
+        parallel_for(lines.size(), kLinesPerTask, [&](size_t r) {
+            double* row = values.data() + thread_index() * num_properties;
+            parse_row(lines[r], begin.row + first + r, ply.vertex, row);
+            store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r,
+                           ply.layout, out);
+        });
         first += lines.size();
     }
     return {begin.row + num_rows, reader.offset()};

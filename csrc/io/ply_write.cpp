@@ -12,10 +12,7 @@
 #include <string>
 #include <vector>
 
-#include <omp.h>
-
-#include "base/first_error.h"
-#include "base/threads.h"
+#include "base/parallel_for.h"
 #include "io/ply.h"
 
 namespace v3dg {
@@ -106,7 +103,7 @@ void append_text(const float* values, size_t count, std::string& text) {
 }
 
 struct Writer {
-    const PosixFile& file;
+    const File& file;
     const PlyGaussians<const float>& gaussians;
     PlyEncoding encoding;
     size_t num_gaussians;
@@ -131,22 +128,16 @@ struct Writer {
         const int num_threads = static_cast<int>(std::min<size_t>(most_threads(), num_blocks()));
         const std::unique_ptr<unsigned char[]> buffers(
             new unsigned char[num_threads * kBlockRows * row_bytes]);
-        FirstError error;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(num_threads)
-        for (size_t block = 0; block < num_blocks(); ++block) {
-            error.run(block, [&] {
-                unsigned char* const begin =
-                    buffers.get() + omp_get_thread_num() * kBlockRows * row_bytes;
-                unsigned char* end = begin;
-                for_rows(block, [&](const float* row) {
-                    store_bytes(row, num_values(), encoding, end);
-                    end += row_bytes;
-                });
-                file.write_at(offset + block * kBlockRows * row_bytes,
-                              reinterpret_cast<char*>(begin), end - begin);
+        parallel_for_on(num_threads, num_blocks(), 1, [&](size_t block) {
+            unsigned char* const begin = buffers.get() + thread_index() * kBlockRows * row_bytes;
+            unsigned char* end = begin;
+            for_rows(block, [&](const float* row) {
+                store_bytes(row, num_values(), encoding, end);
+                end += row_bytes;
             });
-        }
-        error.rethrow();
+            file.write_at(offset + block * kBlockRows * row_bytes, reinterpret_cast<char*>(begin),
+                          end - begin);
+        });
     }
 
     void write_text() const {
@@ -154,16 +145,11 @@ struct Writer {
         std::vector<std::string> texts(kTextBlocks);
         for (size_t first = 0; first < num_blocks(); first += kTextBlocks) {
             const size_t count = std::min(kTextBlocks, num_blocks() - first);
-            FirstError error;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(most_threads())
-            for (size_t b = 0; b < count; ++b) {
-                error.run(b, [&] {
-                    texts[b].clear();
-                    for_rows(first + b,
-                             [&](const float* row) { append_text(row, num_values(), texts[b]); });
-                });
-            }
-            error.rethrow();
+            parallel_for(count, 1, [&](size_t b) {
+                texts[b].clear();
+                for_rows(first + b,
+                         [&](const float* row) { append_text(row, num_values(), texts[b]); });
+            });
             for (size_t b = 0; b < count; ++b) {
                 file.write_at(end, texts[b].data(), texts[b].size());
                 end += texts[b].size();
@@ -177,7 +163,7 @@ struct Writer {
 void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding,
                size_t num_sh, const std::vector<std::string>& comments) {
     const size_t num_gaussians = gaussians.opacities.size;
-    PosixFile file = PosixFile::create(path);
+    File file = File::create(path);
     const std::string header = header_text(num_gaussians, num_sh, encoding, comments);
     file.write_at(0, header.data(), header.size());
     const Writer writer = {.file = file,

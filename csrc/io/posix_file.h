@@ -39,11 +39,9 @@ class PosixFile {
         if (descriptor_ >= 0) ::close(descriptor_);
     }
 
-    struct stat status() const {
-        struct stat status = {};
-        check(::fstat(descriptor_, &status));
-        return status;
-    }
+    size_t size() const { return static_cast<size_t>(status().st_size); }
+    bool is_folder() const { return S_ISDIR(status().st_mode); }
+    bool is_regular() const { return S_ISREG(status().st_mode); }
 
     // Returns the number of bytes that were read: less than `size` only at the end of
     // the file.
@@ -75,7 +73,7 @@ class PosixFile {
 
     // Asks the system to start reading a part of the file. Some systems ignore the
     // request.
-    void expect(size_t offset, size_t size) const {
+    void expect([[maybe_unused]] size_t offset, [[maybe_unused]] size_t size) const {
 #ifdef POSIX_FADV_WILLNEED
         static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset),
                                           static_cast<off_t>(size), POSIX_FADV_WILLNEED));
@@ -102,6 +100,11 @@ class PosixFile {
 
   private:
     explicit PosixFile(int descriptor) : descriptor_(descriptor) { check(descriptor); }
+    struct stat status() const {
+        struct stat status = {};
+        check(::fstat(descriptor_, &status));
+        return status;
+    }
     static void check(ssize_t result) {
         if (result < 0) throw std::system_error(errno, std::generic_category());
     }

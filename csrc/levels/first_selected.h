@@ -40,8 +40,9 @@ class FirstSelected {
     Surroundings around_;
     // The px² per gaussian of each group, at a focal length of 1 px.
     std::vector<double> footprint_;
-    double focal_[kSizes];                                      // focal length of each size, px
-    std::vector<double> of_leaves_[kSizes], of_level_[kSizes];  // losses of each group
+    double focal_[kSizes];  // focal length of the pictures with each size of the asset, px
+    // For each size and group: the sum of losses over its pictures.
+    std::vector<double> of_leaves_[kSizes], of_level_[kSizes];
 };
 
 // The colours of pictures over white, (height, width, 3).

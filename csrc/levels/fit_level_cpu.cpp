@@ -1,10 +1,7 @@
 // Distributes the groups of a level over threads. fit_group/fit_group_cpu.cpp fits one
 // group.
 
-#include "base/threads.h"
 #include "levels/fit_level.h"
-
-#include <omp.h>
 
 #include <algorithm>
 
@@ -41,7 +38,7 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTa
                 const FitGroup& group = groups[first + i / num_pictures];
                 V3DG_DISPATCH_ISA(fit_target, config, group, target,
                                   fit_view(config, group, i % num_pictures),
-                                  scratch[omp_get_thread_num()], images[i]);
+                                  scratch[thread_index()], images[i]);
             });
         }
         parallel_for(last - first, 1, [&](size_t i) {

@@ -25,6 +25,13 @@ struct Reach {
     int top = INT_MAX, bottom = INT_MIN;
 };
 
+// Gaussians that will be projected next, and are loaded into the cache meanwhile.
+template <class T>
+struct NextRun {
+    const GaussianPlanes<T>* model = nullptr;  // null: none, or coded gaussians
+    uint64_t first = 0;
+};
+
 // Projects gaussians [skip, skip + count) of a draw. A gaussian is drawn if it is
 // beyond the near plane, its alpha is at least 1/255 somewhere, its determinant is
 // positive and finite, and it reaches a pixel centre in the window. Writes a record for
@@ -32,10 +39,12 @@ struct Reach {
 //
 // The window is empty or inside the camera's image. Unless `source` is null, source[r]
 // becomes `source_base` plus the index, relative to `skip`, of the gaussian of record
-// r.
-V3DG_DECLARE_PER_ISA(template <class T> size_t project(
-    const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrinsics<T>& camera,
-    const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base, Reach& reach))
+// r. `next` changes no result.
+V3DG_DECLARE_PER_ISA(template <class T> size_t project(const Draw<T>& draw, uint64_t skip,
+                                                       uint64_t count, const Intrinsics<T>& camera,
+                                                       const Window& window, Record<T>* records,
+                                                       uint32_t* source, uint32_t source_base,
+                                                       Reach& reach, const NextRun<T>& next = {}))
 
 // Computes the gradients of gaussians from the gradients of their records. The index of
 // record r's gaussian in the draw is source[r].

@@ -12,10 +12,32 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
+// Requests the cache lines that row i begins in, in all planes.
+template <class T>
+static V3DG_INLINE void prefetch_row(const GaussianPlanes<T>& m, uint64_t i) {
+    for (int k = 0; k < 3; ++k) __builtin_prefetch(m.mean[k] + i);
+    for (int k = 0; k < 4; ++k) __builtin_prefetch(m.quat[k] + i);
+    for (int k = 0; k < 3; ++k) __builtin_prefetch(m.scale[k] + i);
+    __builtin_prefetch(m.opacity + i);
+    for (int k = 0; k < 3 * num_sh_bases(m.sh_degree); ++k) __builtin_prefetch(m.sh[k] + i);
+}
+
 // Reads gaussians from planes (one array per component).
 template <class T>
 struct PlaneSource {
     const GaussianPlanes<T>& m;
+    const NextRun<T>& next;
+
+    // Requests gaussians that are read soon, while row i of a run is projected. The run
+    // has `left` rows from row i on. Clusters are short, and a processor recognises
+    // only a few of the many planes as streams.
+    V3DG_INLINE void prefetch(uint64_t i, uint64_t left) const {
+        constexpr uint64_t kRowsAhead = 64;
+        if (left > kRowsAhead)
+            prefetch_row(m, i + kRowsAhead);
+        else if (next.model != nullptr)
+            prefetch_row(*next.model, next.first + (kRowsAhead - left));
+    }
 
     // Loads a vector of gaussians that starts at row i. All lanes may be read, because
     // planes are padded.
@@ -27,9 +49,10 @@ struct PlaneSource {
         g.opacity = load(m.opacity + i);
         return g;
     }
-    V3DG_INLINE int load_sh(uint64_t i, uint64_t, Vec<T>* sh) const {
-        for (int k = 0; k < 3 * num_sh_bases(m.sh_degree); ++k) sh[k] = load(m.sh[k] + i);
-        return m.sh_degree;
+    V3DG_INLINE void color_of(uint64_t i, uint64_t, const Vec<T> direction[3],
+                              Vec<T> color[3]) const {
+        color_of_coefficients(
+            m.sh_degree, direction, [&](int k) { return load(m.sh[k] + i); }, color);
     }
 };
 
@@ -50,7 +73,9 @@ struct CodeSource {
         decode(words, ranges, g, color);
         return g;
     }
-    V3DG_INLINE int load_sh(uint64_t i, uint64_t count, V* sh) const {
+    V3DG_INLINE void prefetch(uint64_t, uint64_t) const {}
+    V3DG_INLINE void color_of(uint64_t i, uint64_t count, const V direction[3], V color[3]) const {
+        V sh[3 * kMaxShBases];
         Bits<V> words[2 * kMaxShDegree];
         Gaussian3d<V> g;
         load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, kRecordWords,
@@ -59,7 +84,7 @@ struct CodeSource {
         load_words(codes.sh_of(ranges, static_cast<uint32_t>(i)), num_sh_words(codes.sh_degree),
                    2 * codes.sh_stride, count, words);
         decode_sh(words, ranges.sh_step, codes.sh_degree, sh + 3);
-        return codes.sh_degree;
+        color_of_sh(codes.sh_degree, direction, sh, color);
     }
 
   private:
@@ -98,14 +123,14 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
                                       uint64_t count, unsigned lanes, const Gaussian3d<V>& g,
                                       const Ellipse<V>& e, const PixelBox<I>& box,
                                       Record<T>* records) {
-    V sh[3 * kMaxShBases], direction[3], color[3];
+    V direction[3], color[3];
     from_eye(draw.view, g.mean, direction);
     if (draw.palette.sh != nullptr) {
+        V sh[3];
         load_palette(draw.palette, at, lanes, sh);
         color_of_sh(0, direction, sh, color);
     } else {
-        const int sh_degree = from.load_sh(at, count, sh);
-        color_of_sh(sh_degree, direction, sh, color);
+        from.color_of(at, count, direction, color);
         if (draw.color_factors != nullptr) tint(draw.color_factors, color);
     }
     for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
@@ -128,12 +153,15 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
     using V = Vec<T>;
     using I = decltype(V{} < V{});
     constexpr int kWidth = kLanes<T>;
+    constexpr uint64_t kLineRows = 64 / sizeof(T);
     I top = I{} + INT_MAX, bottom = I{} - 1, entries = I{};
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
         const uint64_t at = first + done;
         const unsigned lanes =
             count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
+        // A vector may be shorter than a cache line.
+        if (done % kLineRows == 0) from.prefetch(at, count - done);
         const Gaussian3d<V> g = from.load_gaussians(at, count - done);
         Projection<V, C> s;
         to_view(draw.view, g.mean, s.p);
@@ -210,14 +238,14 @@ static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t cou
 template <class T>
 size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrinsics<T>& camera,
                const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
-               Reach& reach) {
+               Reach& reach, const NextRun<T>& next) {
     return camera.visit([&](const auto& model) {
         if constexpr (std::is_same<T, float>::value)
             if (draw.codes != nullptr)
                 return project_codes(draw, skip, count, model, window, records, source, source_base,
                                      reach);
-        return project_rows(PlaneSource<T>{*draw.model}, draw, draw.first + skip, count, model,
-                            window, records, source, source_base, reach);
+        return project_rows(PlaneSource<T>{*draw.model, next}, draw, draw.first + skip, count,
+                            model, window, records, source, source_base, reach);
     });
 }
 
@@ -289,7 +317,8 @@ void project_backward(const Draw<T>& draw, const uint32_t* source,
 
 #define V3DG_INSTANTIATE(T)                                                                      \
     template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Intrinsics<T>&,         \
-                               const Window&, Record<T>*, uint32_t*, uint32_t, Reach&);          \
+                               const Window&, Record<T>*, uint32_t*, uint32_t, Reach&,           \
+                               const NextRun<T>&);                                               \
     template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, \
                                       size_t, const Intrinsics<T>&, const GaussianRows<T>&);
 V3DG_INSTANTIATE(float)

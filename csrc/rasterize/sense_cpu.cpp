@@ -151,64 +151,20 @@ static V3DG_INLINE void sense_record(const Record<float>& g, uint32_t record, co
     }
 }
 
-// Mixes the mesh of a pixel into the blended picture.
-static V3DG_INLINE void mix_mesh(const SenseTile& tile, int p, size_t at, const SensedSums& behind,
-                                 const SensedShares& share, const MeshLayer& layer,
-                                 const Picture<float>& picture) {
-    const SensedMesh& mesh = tile.mesh[p];
-    if (mesh.coverage <= 0) return;
-    for (int c = 0; c < 3; ++c) {
-        float& color = picture.color[picture.color_step * at + c];
-        color =
-            mixed_color(color, tile.front[p].color[c], layer.color[3 * at + c], mesh, layer.light);
-    }
-    if (picture.alpha != nullptr) picture.alpha[picture.alpha_step * at] = share.alpha;
-    if (picture.depth != nullptr)
-        picture.depth[at] = blended_depth(tile.front[p], behind, mesh, share);
-}
-
-// Writes the ids of a pixel.
-static V3DG_INLINE void write_strongest(const Strongest& strongest, size_t at,
-                                        const SensedRecords& sensed, const Sensor& sensor) {
-    const SensorPlanes& planes = sensor.planes;
-    const MeshLayer& mesh = sensor.mesh;
-    if (planes.weight != nullptr) planes.weight[at] = strongest.weight;
-    if (!planes.wants_ids()) return;
-    int32_t instance = kNoInstance, label = kNoLabel;
-    if (strongest.weight > 0 && strongest.record == kMeshRecord) {
-        instance = mesh.instance == nullptr ? kMeshInstance : mesh.instance[at];
-        if (mesh.label != nullptr) label = mesh.label[at];
-    } else if (strongest.weight > 0) {
-        instance = sensed.instance[strongest.record];
-        if (sensed.label != nullptr) label = sensed.label[instance];
-    }
-    if (planes.instance != nullptr) planes.instance[at] = instance;
-    if (planes.label != nullptr) planes.label[at] = label;
-}
-
 // Writes the channels of the tile's pixels.
 static void write_channels(const SenseTile& tile, const SenseSums& sums,
                            const SensedRecords& sensed, int left, int top,
                            const Picture<float>& picture, const Sensor& sensor) {
-    const SensorPlanes& planes = sensor.planes;
-    const MeshLayer& layer = sensor.mesh;
     const SensedSums nothing{{}, 0, {}, 0, kMeshRecord};
     for_each_pixel(left, top, picture.window, [&](int p, size_t at) {
         const SensedSums last = sums_at(tile, sums, p);
-        const bool has_mesh = layer.is_there() && tile.mesh[p].coverage > 0;
-        const SensedMesh mesh = has_mesh ? tile.mesh[p] : SensedMesh{0, 0, 0};
-        const SensedSums& front = has_mesh ? tile.front[p] : last;
-        const SensedSums& behind = has_mesh ? last : nothing;
-        const SensedShares share =
-            shares_of(tile.blended.transmittance[p], picture.min_transmittance, mesh);
-        if (has_mesh) mix_mesh(tile, p, at, behind, share, layer, picture);
-        if (planes.median_depth != nullptr) planes.median_depth[at] = tile.median[p];
-        if (planes.normal != nullptr) {
-            const float* mesh_normal = layer.normal == nullptr ? nullptr : layer.normal + 3 * at;
-            blended_normal(front, behind, mesh_normal, share, planes.normal + 3 * at);
-        }
-        if (planes.wants_strongest())
-            write_strongest(strongest_of(front, behind, share), at, sensed, sensor);
+        const bool has_mesh = sensor.mesh.is_there() && tile.mesh[p].coverage > 0;
+        const SensedPixel pixel{.transmittance = tile.blended.transmittance[p],
+                                .median_depth = tile.median[p],
+                                .mesh = has_mesh ? tile.mesh[p] : SensedMesh{0, 0, 0},
+                                .front = has_mesh ? tile.front[p] : last,
+                                .behind = has_mesh ? last : nothing};
+        write_pixel(pixel, at, picture.min_transmittance, sensed, sensor, picture);
     });
 }
 

@@ -9,6 +9,7 @@
 // a picture in which the mesh hides what is behind it, and 1 - c parts of a picture
 // without the mesh. Both have the same transmittances in front of the mesh.
 
+#include "frame/image.h"
 #include "frame/sensor.h"
 #include "math/lanes.h"
 #include "math/quat.h"
@@ -129,6 +130,72 @@ V3DG_HD V3DG_INLINE float mixed_color(float without, float front, float mesh_col
     const float in_front = opacity > 0 ? opacity * linear_of_display(front / opacity) : 0.0f;
     const float with = in_front + mesh.passed * mesh_color;
     return display_of_linear(c >= 1 ? with : (1 - c) * linear_of_display(without) + c * with);
+}
+
+// What records have for the sensor pass beside what blending reads. An array is null if
+// no channel needs it.
+struct SensedRecords {
+    const float* normal;      // (N, 3) in view space
+    const int32_t* instance;  // (N); null: all are instance 0
+    const int32_t* label;     // per instance; null: none has a label
+};
+
+// A pixel whose list was blended.
+struct SensedPixel {
+    float transmittance;  // negative if the pixel has stopped
+    float median_depth;
+    SensedMesh mesh;  // coverage 0: none, or one that gaussians hide
+    SensedSums front, behind;
+};
+
+// Mixes the mesh of pixel `at` into the blended picture.
+V3DG_HD V3DG_INLINE void mix_mesh(const SensedPixel& pixel, const SensedShares& share, size_t at,
+                                  const MeshLayer& layer, const Picture<float>& picture) {
+    if (pixel.mesh.coverage <= 0) return;
+    for (int c = 0; c < 3; ++c) {
+        float& color = picture.color[picture.color_step * at + c];
+        color = mixed_color(color, pixel.front.color[c], layer.color[3 * at + c], pixel.mesh,
+                            layer.light);
+    }
+    if (picture.alpha != nullptr) picture.alpha[picture.alpha_step * at] = share.alpha;
+    if (picture.depth != nullptr)
+        picture.depth[at] = blended_depth(pixel.front, pixel.behind, pixel.mesh, share);
+}
+
+// Writes the weight and the ids of pixel `at`.
+V3DG_HD V3DG_INLINE void write_strongest(const Strongest& strongest, size_t at,
+                                         const SensedRecords& sensed, const Sensor& sensor) {
+    const SensorPlanes& planes = sensor.planes;
+    const MeshLayer& mesh = sensor.mesh;
+    if (planes.weight != nullptr) planes.weight[at] = strongest.weight;
+    if (!planes.wants_ids()) return;
+    int32_t instance = kNoInstance, label = kNoLabel;
+    if (strongest.weight > 0 && strongest.record == kMeshRecord) {
+        instance = mesh.instance == nullptr ? kMeshInstance : mesh.instance[at];
+        if (mesh.label != nullptr) label = mesh.label[at];
+    } else if (strongest.weight > 0) {
+        instance = sensed.instance == nullptr ? 0 : sensed.instance[strongest.record];
+        if (sensed.label != nullptr) label = sensed.label[instance];
+    }
+    if (planes.instance != nullptr) planes.instance[at] = instance;
+    if (planes.label != nullptr) planes.label[at] = label;
+}
+
+// Writes the channels of pixel `at`, and mixes its mesh into the picture.
+V3DG_HD V3DG_INLINE void write_pixel(const SensedPixel& pixel, size_t at, float min_transmittance,
+                                     const SensedRecords& sensed, const Sensor& sensor,
+                                     const Picture<float>& picture) {
+    const SensorPlanes& planes = sensor.planes;
+    const SensedShares share = shares_of(pixel.transmittance, min_transmittance, pixel.mesh);
+    mix_mesh(pixel, share, at, sensor.mesh, picture);
+    if (planes.median_depth != nullptr) planes.median_depth[at] = pixel.median_depth;
+    if (planes.normal != nullptr) {
+        const float* mesh_normal = sensor.mesh.normal;
+        if (mesh_normal != nullptr) mesh_normal += 3 * at;
+        blended_normal(pixel.front, pixel.behind, mesh_normal, share, planes.normal + 3 * at);
+    }
+    if (planes.wants_strongest())
+        write_strongest(strongest_of(pixel.front, pixel.behind, share), at, sensed, sensor);
 }
 
 // Computes the normal of a gaussian in view space: its shortest axis, the first one of

@@ -110,24 +110,39 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     }
 }
 
+// Return the transmittance that live pixels stay above.
+template <class T>
+V3DG_INLINE T least_live(StopsBehind<T> stop) {
+    return stop.transmittance;
+}
+template <class T>
+V3DG_INLINE T least_live(StopsBefore) {
+    return T(kMinTransmittance);
+}
+
 // Blends the batch over one block. Returns whether any pixel of the block goes on.
 template <class T, Extra kExtra, class Stop>
 V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels,
                              Stop stop, TilePlanes<T>& tile) {
     using V = Vec<T>;
-    constexpr unsigned kAllStopped = (1u << kLanes<T>)-1;
+    constexpr unsigned kAllLanes = (1u << kLanes<T>)-1;
     const V block_u = load(pixels.corner[block % kTileBlocks]),
-            block_v = load(pixels.corner[block / kTileBlocks]);
+            block_v = load(pixels.corner[block / kTileBlocks]),
+            least = all_lanes<V>(least_live<T>(stop));
     const uint8_t* place = batch.place[block];
     const uint8_t* end = place + batch.count[block];
     bool goes_on = false;
     for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
         const int p = kBlockPixels * block + part * kLanes<T>;
         const V x = load(pixels.x + part * kLanes<T>), y = load(pixels.y + part * kLanes<T>);
-        V t = load(tile.transmittance + p), red = load(tile.color[0] + p),
+        V before = load(tile.transmittance + p), red = load(tile.color[0] + p),
           green = load(tile.color[1] + p), blue = load(tile.color[2] + p),
           extra = kExtra == Extra::kNothing ? V{} : load(tile.extra + p);
-        if (sign_bits_of(t) == kAllStopped) continue;
+        unsigned live = kAllLanes & ~sign_bits_of(before);
+        if (live == 0) continue;
+        // The transmittance, but 0 in stopped lanes, so that they get no weight. Their
+        // transmittance stays in `before`.
+        V t = max_of(before, V{});
         for (const uint8_t* at = place; at != end; ++at) {
             const BatchRecord<T>& g = batch.record[*at];
             const Falloff<V> f = falloff_at(
@@ -136,20 +151,31 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
             // Skip vectors without any contribution. If a vector covers a whole block,
             // this is rare, so the test is left out.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
-            const V weight = blend_weight(alpha_of(f), t, stop);
+            const V alpha = alpha_of(f), behind = transmittance_behind(alpha, t);
+            V weight = alpha * t;
+            // Lanes seldom stop. If none does, which one difference shows, only the
+            // product carries over to the next record.
+            if (sign_bits_of(least - behind) == live) {
+                t = behind;
+            } else {
+                before = t > V{} ? t : before;
+                weight = blend_weight(alpha, before, stop);
+                t = max_of(before, V{});
+                live = kAllLanes & ~sign_bits_of(before);
+            }
             red += weight * all_lanes<V>(g.color[0]);
             green += weight * all_lanes<V>(g.color[1]);
             blue += weight * all_lanes<V>(g.color[2]);
             if (kExtra == Extra::kDepth) extra += weight * all_lanes<V>(g.depth);
             if (kExtra == Extra::kCount) extra += weight > V{} ? all_lanes<V>(T(1)) : V{};
-            if (sign_bits_of(t) == kAllStopped) break;
+            if (live == 0) break;
         }
-        store(tile.transmittance + p, t);
+        store(tile.transmittance + p, t > V{} ? t : before);
         store(tile.color[0] + p, red);
         store(tile.color[1] + p, green);
         store(tile.color[2] + p, blue);
         if (kExtra != Extra::kNothing) store(tile.extra + p, extra);
-        goes_on |= sign_bits_of(t) != kAllStopped;
+        goes_on |= live != 0;
     }
     return goes_on;
 }

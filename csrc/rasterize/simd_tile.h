@@ -56,8 +56,9 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
-// The number of touched blocks from which on the exact test pays off.
-constexpr int kFewBlocks = 5;
+// The number of touched blocks from which on the exact test pays off. A block is drawn
+// fastest if one vector covers it.
+constexpr int kFewBlocks = kLanes<float> == kBlockPixels ? 9 : 5;
 
 // Returns the subset of `blocks` that the ellipse reaches. For each row of blocks, it
 // computes the extent of the ellipse in x over the rows of pixel centres, with the

@@ -15,10 +15,10 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-constexpr int kLog2Spread = 11;    // log2 of the most buckets of a list
+constexpr int kLog2Spread = 11;    // log2 of the maximum number of buckets of a list
 constexpr int kPlanThreads = 256;  // one thread per tile
 constexpr int kSpreadThreads = 1024;
-constexpr int kMostParts = 4;  // most parts of a tile
+constexpr int kMostParts = 4;  // maximum number of parts of a tile
 
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
               "kPiece and kPiece / kMostParts must be the lowest loads of classes");

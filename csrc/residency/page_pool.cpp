@@ -3,8 +3,6 @@
 
 #include "residency/page_pool.h"
 
-#include <unistd.h>
-
 #include <algorithm>
 #include <chrono>
 #include <thread>
@@ -131,7 +129,7 @@ PagePool::PagePool(const std::vector<PagedBundle>& bundles, const PoolLimits& li
 // keeps the state that it writes to. In a child of fork(), the mutex in the state must
 // not be destroyed.
 PagePool::~PagePool() {
-    if (getpid() != state_->shared.process)
+    if (process_id() != state_->shared.process)
         static_cast<void>(new std::shared_ptr<State>(state_));
     else
         state_->stop_threads();

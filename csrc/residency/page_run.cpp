@@ -23,7 +23,7 @@ static std::string name_of(const PageRun& run, size_t page) {
 // Reads `count` pages into contiguous memory, and calls use(page, bytes) for each.
 // Throws PageError for the first page that cannot be read.
 template <class Use>
-static void read_few(const PosixFile& file, const PageRun& run, size_t first, size_t count,
+static void read_few(const File& file, const PageRun& run, size_t first, size_t count,
                      unsigned char* bytes, const Use& use) {
     PageReading pages[kFew];
     for (size_t k = 0; k < count; ++k) {
@@ -73,7 +73,7 @@ static void decode(const PageRun& run, size_t page, PageCodec codec, const unsig
     copy(rows.sh, out.sh, out.num_sh());
 }
 
-void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec,
+void read_pages(const File& file, const PageRun& run, PageCodec codec,
                 const GaussianRows<float>& out) {
     for_few_pages(run, [&](size_t first, size_t count) {
         Buffer<uint32_t> words((run.places[first + count] - run.places[first]) / sizeof(uint32_t) +
@@ -84,7 +84,7 @@ void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec,
     });
 }
 
-void read_codes(const PosixFile& file, const PageRun& run, Span<int32_t> words) {
+void read_codes(const File& file, const PageRun& run, Span<int32_t> words) {
     auto* const bytes = reinterpret_cast<unsigned char*>(words.data);
     for_few_pages(run, [&](size_t first, size_t count) {
         read_few(file, run, first, count, bytes + (run.places[first] - run.places[0]),

@@ -5,7 +5,7 @@
 #include <cstdint>
 
 #include "base/span.h"
-#include "io/posix_file.h"
+#include "io/file.h"
 #include "residency/page_source.h"
 
 namespace v3dg {
@@ -33,10 +33,10 @@ struct PageRun {
 // Reads and verifies all pages, and decodes their gaussians. Precondition: each page
 // has at least the bytes that its codec needs. Throws PageError, which names the first
 // page that cannot be read, but not the file.
-void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec,
+void read_pages(const File& file, const PageRun& run, PageCodec codec,
                 const GaussianRows<float>& out);
 
 // Reads and verifies all pages, without decoding. Throws like read_pages().
-void read_codes(const PosixFile& file, const PageRun& run, Span<int32_t> words);
+void read_codes(const File& file, const PageRun& run, Span<int32_t> words);
 
 }  // namespace v3dg

@@ -51,12 +51,12 @@ FilePages::FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, 
                      Fetch fetch)
     : PageSource(table, sh_degree, codec),
       name_(std::move(name)),
-      file_(PosixFile::duplicate(descriptor)),
+      file_(File::duplicate(descriptor)),
       place_(place.begin(), place.end()),
       hash_(hash.begin(), hash.end()),
       fetch_(std::move(fetch)) {}
 
-static void read_one(const PosixFile& file, Span<const int64_t> places, PageReading& reading,
+static void read_one(const File& file, Span<const int64_t> places, PageReading& reading,
                      const std::function<std::string(size_t)>& name_of) {
     const size_t page = reading.page;
     const auto size = static_cast<size_t>(places[page + 1] - places[page]);
@@ -83,10 +83,10 @@ static size_t end_of_run(Span<const int64_t> places, Span<const PageReading> pag
     return end;
 }
 
-static void read_run(const PosixFile& file, Span<const int64_t> places, Span<PageReading> run,
+static void read_run(const File& file, Span<const int64_t> places, Span<PageReading> run,
                      const std::function<std::string(size_t)>& name_of) {
     char skipped[kMostSkippedBytes];
-    iovec pieces[2 * kMostPagesTogether];
+    FilePiece pieces[2 * kMostPagesTogether];
     size_t count = 0;
     const int64_t first = places[run[0].page];
     int64_t place = first;
@@ -106,7 +106,7 @@ static void read_run(const PosixFile& file, Span<const int64_t> places, Span<Pag
     for (PageReading& reading : run) read_one(file, places, reading, name_of);
 }
 
-void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
+void read_verified(const File& file, Span<const int64_t> places, const uint8_t* hashes,
                    Span<PageReading> pages, const std::function<std::string(size_t)>& name_of) {
     assert(pages.size <= kMostPagesTogether);
     for (size_t first = 0, end = 0; first < pages.size; first = end) {

@@ -12,7 +12,7 @@
 #include <vector>
 
 #include "base/span.h"
-#include "io/posix_file.h"
+#include "io/file.h"
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
@@ -44,7 +44,7 @@ constexpr size_t kMostPagesTogether = 64;
 // their hashes, several at once. Adjacent pages are read in one system call, with small
 // gaps between them. `places` is [P + 1], the offset of each page and the end; `hashes`
 // is [P][16]. Errors begin with name_of(page).
-void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
+void read_verified(const File& file, Span<const int64_t> places, const uint8_t* hashes,
                    Span<PageReading> pages, const std::function<std::string(size_t)>& name_of);
 
 enum class PageCodec { float32, quantized };
@@ -117,7 +117,7 @@ class FilePages : public PageSource {
     bool fetch(Span<PageReading> pages) const;
 
     const std::string name_;
-    const PosixFile file_;
+    const File file_;
     const std::vector<int64_t> place_;
     const std::vector<uint8_t> hash_;
     const Fetch fetch_;

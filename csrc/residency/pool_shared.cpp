@@ -16,7 +16,7 @@ PoolShared::PoolShared(const PoolLimits& pool_limits, size_t num_slots)
       missing(num_slots == 0 ? 0 : 1) {}
 
 void PoolShared::check_process() const {
-    if (getpid() != process)
+    if (process_id() != process)
         throw std::runtime_error(
             "memory: this renderer is from before a fork; create a new one in this process");
 }

@@ -16,9 +16,6 @@
 // (.ci/check_threads.py). Functions take PoolShared as an argument, so that clang sees
 // that the caller and the function use the same mutex.
 
-#include <sys/types.h>
-#include <unistd.h>
-
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
@@ -26,6 +23,7 @@
 #include <vector>
 
 #include "base/mutex.h"
+#include "base/process.h"
 #include "residency/page_blocks.h"
 #include "residency/page_policy.h"
 #include "residency/pool_types.h"
@@ -36,7 +34,7 @@ struct PoolShared {
     PoolShared(const PoolLimits& pool_limits, size_t num_slots);
 
     const PoolLimits limits;
-    const pid_t process = getpid();
+    const int64_t process = process_id();
     // If false, the threads that call the pool also decide and read.
     const bool has_threads;
 

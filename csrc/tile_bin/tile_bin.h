@@ -62,11 +62,46 @@ struct TileLists {
 // The largest number of records in a chunk.
 constexpr uint64_t kMostChunkRecords = uint64_t(1) << 21;
 
+// The format of a chunk's entries: all bits of a depth, and the index in the chunk.
+constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0, INT32_MAX);
+
+// The lists of all tiles of a picture that one thread draws, in kChunkFormat.
+struct GrowingLists {
+    class List {
+      public:
+        void clear() { next_ = entries_.data(); }
+        V3DG_INLINE void append(uint64_t entry) {
+            if (next_ == entries_.data() + entries_.capacity()) grow();
+            *next_++ = entry;
+        }
+        uint64_t* data() const { return entries_.data(); }
+        size_t size() const { return static_cast<size_t>(next_ - entries_.data()); }
+
+      private:
+        void grow();
+
+        Buffer<uint64_t> entries_;
+        uint64_t* next_ = nullptr;
+    };
+    std::vector<List> list;
+
+    void start(const TileGrid& grid) {
+        if (list.size() < grid.size()) list.resize(grid.size());
+        for (List& tile : list) tile.clear();
+    }
+};
+
 // Bins the records of one chunk: records[first] to records[first + count]. It is
 // fastest while the records are in the cache. Chunks may be binned concurrently.
 template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out);
+
+// Appends records [first, first + count) to the lists of their tiles. Precondition:
+// `first` + `count` is at most kMostChunkRecords.
+template <class T>
+void append_records(const Record<T>* records, uint32_t first, uint32_t count, const TileGrid& grid,
+                    GrowingLists& out);
 
 // Joins the lists of all chunks into one list per tile. If `stop` becomes true, it
 // returns soon, and the lists are incomplete.

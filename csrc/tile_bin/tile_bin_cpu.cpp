@@ -5,15 +5,13 @@
 #include "tile_bin/tile_bin.h"
 
 #include <algorithm>
+#include <bit>
 #include <cstring>
 
 #include "base/parallel_for.h"
 #include "base/stop.h"
 
 namespace v3dg {
-
-// The format of a chunk's entries: all bits of a depth, and the index in the chunk.
-static constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0, INT32_MAX);
 
 // Calls visit(tile, box in the tile) for the tiles that a record's box touches. Most
 // boxes touch one tile.
@@ -71,6 +69,26 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
     out.chunk[chunk].most_depth = most;
 }
 
+void GrowingLists::List::grow() {
+    constexpr size_t kLeastCapacity = 512;
+    const size_t used = size();
+    Buffer<uint64_t> larger(std::max(kLeastCapacity, 2 * used));
+    std::copy(entries_.data(), next_, larger.data());
+    entries_ = std::move(larger);
+    next_ = entries_.data() + used;
+}
+
+template <class T>
+void append_records(const Record<T>* records, uint32_t first, uint32_t count, const TileGrid& grid,
+                    GrowingLists& out) {
+    for (uint32_t i = first; i < first + count; ++i) {
+        const uint32_t depth = depth_bits_of(static_cast<float>(records[i].depth));
+        const uint64_t whole = kChunkFormat.entry(depth, i, 0);
+        for_each_tile(records[i], grid,
+                      [&](size_t t, uint32_t box) { out.list[t].append(whole | box); });
+    }
+}
+
 // Returns the format for the entries of all these chunks.
 static EntryFormat format_of(const TileLists::Chunk* chunk, size_t num_chunks) {
     uint64_t end = 0;
@@ -123,9 +141,40 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
     });
 }
 
+constexpr int kMostDigitBits = 12;
+
+// Returns the bits of a digit for sorting `count` entries. Few entries need few
+// counters.
+static int digit_bits_of(size_t count) {
+    if (count < 1024) return 8;
+    if (count < 8192) return 10;
+    return count < 32768 ? 11 : kMostDigitBits;
+}
+
+static void counts_to_starts(uint32_t* counts, size_t size) {
+    uint32_t sum = 0;
+    for (size_t d = 0; d < size; ++d) {
+        const uint32_t digit_count = counts[d];
+        counts[d] = sum;
+        sum += digit_count;
+    }
+}
+
+// Sorts a few entries by their depth bits. The sort is stable.
+static void insert_by_bits(int depth_shift, uint64_t* entry, size_t count) {
+    for (size_t i = 1; i < count; ++i) {
+        const uint64_t moved = entry[i];
+        size_t k = i;
+        for (; k > 0 && entry[k - 1] >> depth_shift > moved >> depth_shift; --k)
+            entry[k] = entry[k - 1];
+        entry[k] = moved;
+    }
+}
+
 // Sorts entries by their depth bits. The sort is stable.
 static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_t* scratch) {
-    constexpr size_t kSmall = 256;
+    constexpr size_t kFew = 16, kSmall = 256;
+    if (count <= kFew) return insert_by_bits(depth_shift, entry, count);
     if (count <= kSmall) {
         const uint64_t low = (uint64_t(1) << depth_shift) - 1;
         for (size_t i = 0; i < count; ++i) {
@@ -136,38 +185,45 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
         for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~low) | scratch[entry[i] & low];
         return;
     }
-    // A radix sort from the least significant digit. It sorts only the bits that differ
-    // after the smallest depth is subtracted.
-    constexpr int kMostBits = 12;
-    // Few entries need few counters.
-    const int most_bits = count < 1024 ? 8 : kMostBits;
     uint64_t least = ~uint64_t(0), most = 0;
     for (size_t i = 0; i < count; ++i) {
         least = std::min(least, entry[i]);
         most = std::max(most, entry[i]);
     }
     least = least >> depth_shift << depth_shift;
-    int bits = 0;
-    while ((most - least) >> depth_shift >> bits != 0) ++bits;
-    const int passes = (bits + most_bits - 1) / most_bits;
-    uint64_t* from = entry;
-    uint64_t* to = scratch;
-    for (int pass = 0; pass < passes; ++pass) {
-        const int digit = (bits + passes - 1) / passes, shift = depth_shift + pass * digit;
-        const uint64_t mask = (uint64_t(1) << digit) - 1;
-        uint32_t start[1u << kMostBits];
-        std::fill_n(start, mask + 1, 0);
-        for (size_t i = 0; i < count; ++i) ++start[(from[i] - least) >> shift & mask];
-        uint32_t sum = 0;
-        for (uint64_t d = 0; d <= mask; ++d) {
-            const uint32_t digit_count = start[d];
-            start[d] = sum;
-            sum += digit_count;
-        }
-        for (size_t i = 0; i < count; ++i) to[start[(from[i] - least) >> shift & mask]++] = from[i];
-        std::swap(from, to);
+    const int bits = static_cast<int>(std::bit_width((most - least) >> depth_shift));
+    if (bits == 0) return;
+    // A radix sort of two digits, which contain only bits that differ after the
+    // smallest depth is subtracted. If bits are left, few neighbours are out of order.
+    const int sorted_bits = std::min(bits, 2 * digit_bits_of(count));
+    const int key_shift = depth_shift + bits - sorted_bits;
+    const int low_bits = sorted_bits / 2;
+    const uint64_t low_mask = (uint64_t(1) << low_bits) - 1;
+    uint32_t low_start[1u << kMostDigitBits], high_start[1u << kMostDigitBits];
+    std::fill_n(low_start, low_mask + 1, 0);
+    std::fill_n(high_start, uint64_t(1) << (sorted_bits - low_bits), 0);
+    for (size_t i = 0; i < count; ++i) {
+        const uint64_t key = (entry[i] - least) >> key_shift;
+        ++low_start[key & low_mask];
+        ++high_start[key >> low_bits];
     }
-    if (from != entry) std::memcpy(entry, from, count * sizeof *entry);
+    counts_to_starts(low_start, low_mask + 1);
+    counts_to_starts(high_start, uint64_t(1) << (sorted_bits - low_bits));
+    for (size_t i = 0; i < count; ++i)
+        scratch[low_start[(entry[i] - least) >> key_shift & low_mask]++] = entry[i];
+    for (size_t i = 0; i < count; ++i)
+        entry[high_start[(scratch[i] - least) >> key_shift >> low_bits]++] = scratch[i];
+    if (sorted_bits == bits) return;
+    for (size_t i = 1; i < count; ++i) {
+        if (entry[i - 1] >> depth_shift <= entry[i] >> depth_shift) continue;
+        const uint64_t key = (entry[i] - least) >> key_shift;
+        const auto has_key = [&](uint64_t e) { return (e - least) >> key_shift == key; };
+        size_t first = i - 1, last = i + 1;
+        while (first > 0 && has_key(entry[first - 1])) --first;
+        while (last < count && has_key(entry[last])) ++last;
+        sort_by_bits(depth_shift, entry + first, last - first, scratch);
+        i = last - 1;
+    }
 }
 
 // Sorts entries by the depths of their records. The sort is stable.
@@ -204,5 +260,9 @@ template void bin_chunk<float>(const Record<float>*, uint64_t, uint32_t, const T
                                TileLists&);
 template void bin_chunk<double>(const Record<double>*, uint64_t, uint32_t, const TileGrid&, size_t,
                                 TileLists&);
+template void append_records<float>(const Record<float>*, uint32_t, uint32_t, const TileGrid&,
+                                    GrowingLists&);
+template void append_records<double>(const Record<double>*, uint32_t, uint32_t, const TileGrid&,
+                                     GrowingLists&);
 
 }  // namespace v3dg

@@ -219,3 +219,16 @@ def test_gsplat_draws_what_v3dg_does(gsplat_example):
     example, config = gsplat_example
     assert example.main(config) > 50
     assert config.output.is_file()
+
+
+def test_a_robot_stands_among_donuts(tmp_path):
+    example = load_example("robot_among_splats")
+    path = tmp_path / "robot.png"
+    image = example.main(example.Config(path, gaussians=2000, size=(96, 64)))
+    labels = {example.FLOOR_LABEL, example.ROBOT_LABEL, example.FOOD_LABEL, -1}
+    assert set(np.unique(image.label)) == labels
+    seen = {number for number in np.unique(image.instance) if 0 <= number < example.FIRST_PART}
+    assert seen == {0, 1, 2, 3}, "every donut, also the one on the arm"
+    assert np.median(image.alpha[image.label == example.ROBOT_LABEL]) == 1
+    with Image.open(tmp_path / "robot_channels.png") as channels:
+        assert channels.size == (192, 128)

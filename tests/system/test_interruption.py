@@ -87,8 +87,9 @@ except KeyboardInterrupt:
 
 def test_an_interrupt_that_waits_is_forgotten_at_the_end(tmp_path):
     code = """
+from v3dg import _system
 from v3dg.cli import main
-_start._AGAIN_AFTER_S = 0.5  # long enough to end before
+_system.AGAIN_AFTER_S = 0.5  # long enough to end before
 import slow
 sys.argv[1:] = ["--version"]
 main()

@@ -378,7 +378,7 @@ class Shutter(Enum):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"camera_model": "fisheye"}, "camera_model: 'fisheye' is not supported; undistort"),
+        ({"camera_model": "fisheye"}, "camera_model: 'fisheye' is not supported; only pinholes"),
         ({"radial_coeffs": torch.zeros(1, 6)}, "radial_coeffs: .* is not supported"),
         ({"rolling_shutter": Shutter.TOP_TO_BOTTOM}, "rolling_shutter: .* is not supported"),
         ({"with_ut": True}, "with_ut: True is not supported"),

@@ -3,6 +3,7 @@ once, into a local file without a name."""
 
 import contextlib
 import os
+import shutil
 import tempfile
 import threading
 import weakref
@@ -31,6 +32,7 @@ _MOST_UNKNOWN_BYTES = 2 << 30
 _SPARE_BYTES = 256 << 20
 # Number of files that are kept open for later use. Files in use are not counted.
 _MOST_OPENED = 256
+_COPIED_BYTES = 1 << 20  # bytes that are copied at once
 # The USD library selects the format by the end of the name.
 _NEEDS_NAME = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -109,6 +111,15 @@ def _source_of(url: str) -> Source:
     return OtherSource(file_system, path)
 
 
+def _copy(descriptor: int, path: str) -> None:
+    """Copy the content of an open file to a new file."""
+    offset = 0
+    with open(path, "xb") as copy:
+        while data := _files.read_bytes_at(descriptor, _COPIED_BYTES, offset):
+            copy.write(data)
+            offset += len(data)
+
+
 class FileAtUrl(os.PathLike[str]):
     """A file at a URL. The parts that are used are downloaded once into a local file
     without a name, of which nothing remains on disk, however the process ends.
@@ -150,17 +161,22 @@ class FileAtUrl(os.PathLike[str]):
 
         The name refers to an open file of this process. If the reader depends on the
         end of the name, it is a symbolic link to that file, which is removed
-        afterwards.
+        afterwards. Without /proc, it is a copy of the file, which is removed, too.
         """
         self._fetch_whole()
         name = f"/proc/self/fd/{self.file.fileno()}"
-        if not self.needs_name:
+        has_name = os.path.exists(name)
+        if has_name and not self.needs_name:
             yield name
             return
-        with tempfile.TemporaryDirectory(prefix="v3dg_") as folder:
-            link = os.path.join(folder, f"file{beside(self._url).suffix}")
-            os.symlink(name, link)
-            yield link
+        # Windows cannot remove a file that the reader has left open.
+        with tempfile.TemporaryDirectory(prefix="v3dg_", ignore_cleanup_errors=True) as folder:
+            local = os.path.join(folder, f"file{beside(self._url).suffix}")
+            if has_name:
+                os.symlink(name, local)
+            else:
+                _copy(self.file.fileno(), local)
+            yield local
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
         """Download the bytes of all parts (offset of the first byte, offset after the
@@ -233,7 +249,6 @@ class FileAtUrl(os.PathLike[str]):
             raise no_room(tempfile.gettempdir(), error) from None
 
     def _check_room(self, num_bytes: int) -> None:
-        status = os.fstatvfs(self.file.fileno())
-        free = status.f_bavail * status.f_frsize
+        free = shutil.disk_usage(tempfile.gettempdir()).free
         if num_bytes + _SPARE_BYTES > free:
             raise no_room(tempfile.gettempdir())

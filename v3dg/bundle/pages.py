@@ -67,8 +67,9 @@ class PageLayout:
         return codec.page_bytes(np.diff(self.first_gaussian), np.diff(self.first_cluster))
 
     def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> "PageRun":
-        """Return pages `first_page` to `last_page`. ``places`` has the offset of each
-        page in a file, and the end of the last page."""
+        """Return the pages from `first_page` up to, but not including, `last_page`.
+        ``places`` has the offset of each page in a file, and the end of the last page.
+        """
         clusters = self.first_cluster[first_page : last_page + 1]
         return PageRun(
             first_page=first_page,
@@ -172,8 +173,8 @@ class FilePages:
         self._last_page: tuple[int, Gaussians | None] = (-1, None)
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Return the gaussians of neighbouring pages on the host, after verifying their
-        hashes."""
+        """Return the gaussians of the pages from ``first_page`` up to, but not
+        including, ``last_page`` on the host, after verifying their hashes."""
         cached_page, cached = self._last_page
         if first_page == cached_page == last_page - 1 and cached is not None:
             return cached

@@ -24,7 +24,7 @@ from typing import Annotated, Any, TypeAlias, cast
 
 import tyro
 
-from v3dg import _start
+from v3dg import _core, _start, _system
 from v3dg._version import __version__
 from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, tell
 
@@ -130,7 +130,7 @@ class Program:
             code = code or _fail("interrupted", INTERRUPTED)
         if arguments is None:
             # At the end of the process, signals are ignored.
-            for number in _start.SIGNALS:
+            for number in _system.SIGNALS:
                 signal.signal(number, signal.SIG_IGN)
             if code == INTERRUPTED:
                 os._exit(code)  # does not wait for other threads
@@ -240,14 +240,17 @@ def _plainly(text: str) -> str:
 
 def _set_threads(threads: int | None) -> None:
     """Restart this process with a number of threads, because OpenMP reads that number
-    only once, when it is loaded."""
+    only once, when it is loaded. Without OpenMP, it is read by the first parallel
+    loop."""
     if threads is None:
         return
     check_range("--threads", threads, 1, _MOST_THREADS)
     if os.environ.get("OMP_NUM_THREADS") != str(threads):
         os.environ["OMP_NUM_THREADS"] = str(threads)
+        if not _core.has_openmp:
+            return
         # Ctrl-C stays blocked until the new process can handle it.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        _system.block_signals({signal.SIGINT})
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from v3dg._start import SIGNALS
+from v3dg._system import SIGNALS
 from v3dg._urls import is_url, shown
 from v3dg.cameras import Axis
 from v3dg.cli._common import (

@@ -45,7 +45,7 @@ _FARTHEST = 1e10
 _IGNORED = {"tile_size", "channel_chunk", "segmented"}
 # Arguments of gsplat that are not supported, with advice.
 _UNSUPPORTED = {
-    "camera_model": "undistort the pictures first",
+    "camera_model": "only pinholes are supported; undistort pictures of fisheyes",
     "radial_coeffs": "undistort the pictures first",
     "tangential_coeffs": "undistort the pictures first",
     "thin_prism_coeffs": "undistort the pictures first",

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-# With O_NONBLOCK, opening a pipe does not wait for a writer. The flag has no effect on
-# regular files.
-_FILE = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+from v3dg import _files
+
+_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _files.PLAIN
+_FILE = os.O_RDONLY | _files.OPEN_SAFELY
 
 
 def folders_above(name: str) -> list[str]:
@@ -19,40 +19,76 @@ def folders_above(name: str) -> list[str]:
     return ["/".join(parts[: count + 1]) for count in range(len(parts))]
 
 
+@contextmanager
+def _opened_below(descriptor: int, folders: list[str]) -> Iterator[int]:
+    """Yield a descriptor of a folder below an open one, opened part by part."""
+    inner = os.dup(descriptor)
+    try:
+        for folder in folders:
+            subfolder = os.open(folder, _FOLDER | _files.NO_LINK, dir_fd=inner)
+            os.close(inner)
+            inner = subfolder
+        yield inner
+    finally:
+        os.close(inner)
+
+
 class Folder(AbstractContextManager["Folder"]):
     """An open folder. All names are relative to this folder and use `/` as separator.
-    No link is followed.
+    No link is followed. Where the system cannot open folders, links are refused when a
+    name is used, which does not protect from programs that replace a folder meanwhile.
 
     If a folder in a name is a link or a file, OSError is raised. Errors contain
     `display_path` instead of the real path.
     """
 
     def __init__(self, path: Path, display_path: Path) -> None:
+        self._path = path
         self._display_path = display_path
-        self.descriptor = os.open(path, _FOLDER)
+        self._descriptor: int | None = None
+        if _files.HAS_FOLDER_DESCRIPTORS:
+            self._descriptor = os.open(path, _FOLDER)
 
     def __exit__(self, *_: object) -> None:
-        os.close(self.descriptor)
+        if self._descriptor is not None:
+            os.close(self._descriptor)
 
     @contextmanager
-    def _folder_of(self, name: str) -> Iterator[tuple[int, str]]:
+    def _folder_of(self, name: str) -> Iterator[tuple[int | None, str]]:
         """Yield a descriptor of the folder that contains a file or folder, and the last
-        part of the name."""
+        part of the name; without descriptors of folders, None and the whole path."""
         *folders, last = name.split("/")
-        descriptor = os.dup(self.descriptor)
         try:
-            for folder in folders:
-                subfolder = os.open(folder, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
-                os.close(descriptor)
-                descriptor = subfolder
-            yield descriptor, last
+            if self._descriptor is None:
+                yield None, os.path.join(self._checked_folder(folders), last)
+            else:
+                with _opened_below(self._descriptor, folders) as descriptor:
+                    yield descriptor, last
         except OSError as error:
             if error.errno is None:
                 raise
             path = os.fspath(self._display_path / name)
             raise OSError(error.errno, os.strerror(error.errno), path) from error
-        finally:
-            os.close(descriptor)
+
+    def _checked_folder(self, folders: list[str]) -> Path:
+        path = self._path
+        for folder in folders:
+            path = path / folder
+            if not stat.S_ISDIR(os.lstat(path).st_mode):
+                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        return path
+
+    def names(self) -> list[str]:
+        """Return the names of all files and folders in this folder."""
+        if self._descriptor is None:
+            return os.listdir(self._path)
+        return os.listdir(self._descriptor)
+
+    def make_private_folder(self, name: str) -> None:
+        """Create a folder that other users cannot read; raise FileExistsError if the
+        name exists."""
+        with self._folder_of(name) as (folder, last):
+            os.mkdir(last, 0o700, dir_fd=folder)
 
     def status(self, name: str) -> os.stat_result | None:
         """Return the status of a file, a folder or a link; None if the name does not
@@ -67,6 +103,8 @@ class Folder(AbstractContextManager["Folder"]):
         """Open a file for reading and return its descriptor; raise OSError for a link,
         and ValueError for a folder or a device."""
         with self._folder_of(name) as (folder, last):
+            if folder is None and os.path.islink(last):
+                raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
             descriptor = os.open(last, _FILE, dir_fd=folder)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)

@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from v3dg import _files
 from v3dg._numbers import check
 from v3dg._urls import is_url
 from v3dg.export._below import Folder, folders_above
@@ -30,7 +31,6 @@ from v3dg.export._record import (
     stamp_of_content,
     stamp_of_status,
 )
-from v3dg.levels.scratch import lock
 from v3dg.scene import Scene
 
 _HIDDEN = re.compile(r"\.v3dg-export\.[0-9a-f]{16}\.tmp")
@@ -96,13 +96,17 @@ def replacing_export(
         "a new folder or one with an earlier export, got a file; choose another name",
     )
     check_outside(folder, (bundle.path for bundle in scene.bundles))
-    with _made(folder) as target, _naming_errors(folder, target), Folder(target, folder) as root:
-        lock(root.descriptor, folder, "export")
+    with (
+        _made(folder) as target,
+        _naming_errors(folder, target),
+        _files.locked_folder(target, folder, "export"),
+        Folder(target, folder) as root,
+    ):
         place = _Place(folder, target, root, overwrite=overwrite)
         place.check(certain)
         try:
-            os.mkdir(place.hidden, 0o700, dir_fd=root.descriptor)
-            os.mkdir(f"{place.hidden}/new", dir_fd=root.descriptor)
+            root.make_private_folder(place.hidden)
+            root.make_folder(f"{place.hidden}/new")
             path = target / place.hidden / "new"
             yield NewFiles(path, place.earlier.keys())
             place.put(Record.of_files_below(path), path.parent / RECORD)
@@ -173,11 +177,11 @@ class _Place:
         self._root = root
         self._overwrite = overwrite
         self.hidden = f".v3dg-export.{secrets.token_hex(8)}.tmp"
-        unfinished = [name for name in os.listdir(root.descriptor) if _HIDDEN.fullmatch(name)]
+        unfinished = [name for name in root.names() if _HIDDEN.fullmatch(name)]
         for name in unfinished:
             _clear_up(root, name, folder)
         record = read_record(root, RECORD, folder / RECORD)
-        is_empty = not set(os.listdir(root.descriptor)) - set(unfinished)
+        is_empty = not set(root.names()) - set(unfinished)
         advice = (
             "choose another folder, or overwrite, which replaces files with the same names and "
             "removes none"

@@ -1,6 +1,5 @@
 """The host memory that a build may use, and the number of units that fit into it."""
 
-import os
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from v3dg import _device
+from v3dg import _device, _system
 from v3dg._device import Device
 from v3dg._numbers import refuse, value_text
 from v3dg.gaussians import gaussian_bytes
@@ -85,10 +84,7 @@ def free_on(device: Device) -> int:
 def free_bytes() -> int:
     """Return the free memory in bytes: of the system, or of the container of the
     process if the container has less."""
-    free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    with suppress(OSError, ValueError, AttributeError, TypeError):
-        text = Path("/proc/meminfo").read_text(encoding="ascii")
-        free = int(re.search(r"MemAvailable:\s*(\d+)", text)[1]) << 10  # type: ignore[index]
+    free = _system.available_memory()
     with suppress(OSError, ValueError):  # no cgroup, or the limit is "max"
         group = Path("/sys/fs/cgroup")
         limit = int((group / "memory.max").read_text())

@@ -1,7 +1,5 @@
 """Scratch folders: files of rows that are removed when the work is done."""
 
-import errno
-import fcntl
 import os
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -31,7 +29,7 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
         flags = os.O_RDONLY
         if must_be_new:
             flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
-        self._descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        self._descriptor = os.open(path, flags | _files.NO_LINK | _files.PLAIN, 0o600)
 
     def __exit__(self, *_: object) -> None:
         os.close(self._descriptor)
@@ -67,9 +65,7 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
     Files with these names that a killed run has left are removed.
     """
     folder.mkdir(mode=0o700, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    try:
-        lock(descriptor, folder)
+    with _files.locked_folder(folder, folder):
         present = os.listdir(folder)
         own_names: set[str] = set()
         if _MARK in present:
@@ -83,7 +79,11 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
         # The mark is the first file to be created and the last to be removed: in a
         # folder without a mark, no file is from a build.
         os.close(
-            os.open(folder / _MARK, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            os.open(
+                folder / _MARK,
+                os.O_WRONLY | os.O_CREAT | _files.NO_LINK | _files.PLAIN,
+                0o600,
+            )
         )
         try:
             _remove(folder, names)
@@ -93,24 +93,6 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
             _remove(folder, [_MARK])
             with suppress(OSError):
                 folder.rmdir()
-    finally:
-        os.close(descriptor)
-
-
-def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> None:
-    """Lock an open file or folder against other processes that do the same work, until
-    it is closed."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise RuntimeError(
-            f"{os.fspath(path)}: another {work} is using it; wait for it, or write to another place"
-        ) from None
-    except OSError as error:
-        # Some network file systems have no locks; users must not start two builds with
-        # the same output there.
-        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
-            raise
 
 
 def _remove(folder: Path, names: Collection[str]) -> None:

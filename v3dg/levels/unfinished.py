@@ -31,7 +31,6 @@ from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.bundle.pages import PageRun
 from v3dg.gaussians import Gaussians, put
 from v3dg.levels.plan import LevelPlan
-from v3dg.levels.scratch import lock
 from v3dg.levels.simplify import Level, LevelTables
 
 # A record begins with the number of its part, the number of its level, and the hash of
@@ -85,9 +84,9 @@ class PageFile:
         """Open the file anew, so that on a network file system this machine and others
         see each other's writes."""
         with _files.naming_errors(self.path):
-            descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+            descriptor = os.open(self.path, flags | _files.OPEN_SAFELY)
             try:
-                head = os.pread(descriptor, len(self.head), 0)
+                head = _files.read_bytes_at(descriptor, len(self.head), 0)
                 check(
                     self.path,
                     head == self.head,
@@ -145,7 +144,7 @@ class Unfinished:
     def _continue(self, descriptor: int, magic: bytes) -> None:
         """Read the levels that an interrupted build of the same bundle has finished, or
         begin an empty file."""
-        head = os.pread(descriptor, len(self._plan.header), 0)
+        head = _files.read_bytes_at(descriptor, len(self._plan.header), 0)
         if head == self._plan.header:
             os.ftruncate(descriptor, self._plan.num_bytes)
             with self._reading():
@@ -158,6 +157,7 @@ class Unfinished:
             try:
                 _files.write_at(descriptor, magic, 0)
             except OSError:
+                _files.close_to_move(self._file)
                 self._path.unlink()
                 raise
         else:
@@ -167,6 +167,7 @@ class Unfinished:
             )
 
     def __exit__(self, *_: object) -> None:
+        _files.close_to_move(self._file)
         if not self.is_whole and not any(number > 0 for _, number in self.levels):
             self._path.unlink(missing_ok=True)
         self._file.close()
@@ -237,7 +238,7 @@ class Unfinished:
             except OSError:
                 # Writing the head works on a full disk, because it overwrites existing
                 # bytes.
-                os.pwrite(descriptor, self.pages.head, 0)
+                _files.write_at(descriptor, self.pages.head, 0)
                 raise
             self.is_whole = True
             os.ftruncate(descriptor, self._plan.num_bytes)
@@ -250,6 +251,7 @@ class Unfinished:
         to refine again. Without a final path, this file stays and the refined bundle is
         in memory.
         """
+        _files.close_to_move(self._file)
         if refine is not None:
             refined = refine(Bundle.open(self._path))
             if self._bundle_path is None:
@@ -314,10 +316,11 @@ def discard_levels(resume_path: str | os.PathLike[str]) -> None:
     """
     if os.path.lexists(resume_path):
         with _open_locked(resume_path) as file:
-            head = os.pread(file.fileno(), len(_MAGIC), 0)
+            head = _files.read_bytes_at(file.fileno(), len(_MAGIC), 0)
             is_ours = _MAGIC.startswith(head) or _is_bundle(resume_path)
             expected = "levels of an interrupted build, got another file; move it elsewhere"
             check(resume_path, is_ours, expected)
+            _files.close_to_move(file)
             os.unlink(resume_path)
 
 
@@ -334,9 +337,7 @@ def _is_bundle(path: str | os.PathLike[str]) -> bool:
 def _open_locked(path: str | os.PathLike[str]) -> FileIO:
     """Open or create a file for reading and writing, locked against other builds until
     it is closed."""
-    # With O_NONBLOCK, opening a pipe does not wait for a writer. The flag has no effect
-    # on regular files.
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+    flags = os.O_RDWR | os.O_CREAT | _files.OPEN_SAFELY
     while True:
         check(
             path, not os.path.islink(path), "an ordinary file, got a symbolic link; remove the link"
@@ -351,7 +352,7 @@ def _open_locked(path: str | os.PathLike[str]) -> FileIO:
                 stat.S_ISREG(status.st_mode),
                 "an ordinary file, got a device or a pipe; choose another path",
             )
-            lock(file.fileno(), path)
+            _files.lock(file.fileno(), path)
             # The process that held the lock before may have removed the file. In this
             # case it is opened again.
             with suppress(FileNotFoundError):

@@ -23,7 +23,7 @@ from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, sensor_of
+from v3dg.render.sensor import Channel, MeshLayer, mesh_device, sensor_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
@@ -120,10 +120,11 @@ def render(
         channels: Names of channels that are drawn beside colour and alpha, and are then
             attributes of the picture: "depth" (as `depth=True`), "median_depth",
             "normal", "instance", "label", "weight", "clipped" (docs/sensors.md). All
-            but "depth" only on the CPU so far; "clipped" only for pinholes.
+            but "depth" only on the CPU so far, or for an asset; "clipped" only on the
+            CPU and for pinholes.
         mesh: Picture of meshes of the same size, for one camera: its pixels hide what
             is behind them. Colour, alpha and the channels are those of gaussians and
-            meshes together. Only on the CPU so far.
+            meshes together. Only on the CPU so far, or for an asset.
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what
             the next picture of the same scene or bundle needs; a `Renderer` controls
@@ -143,8 +144,9 @@ def render(
     one_of(color_by, "color_by", get_args(ColorBy))
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
-    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth)
     is_asset = isinstance(opened_subject, Gaussians)
+    place = mesh_device(chosen_device, opened_subject)
+    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=place)
     shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:

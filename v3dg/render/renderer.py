@@ -20,7 +20,7 @@ from v3dg.render.frame import frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, sensor_of
+from v3dg.render.sensor import Channel, MeshLayer, mesh_device, sensor_of
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
 
@@ -143,7 +143,8 @@ class Renderer:
         check_camera(camera)
         subject = self._subject
         is_asset = isinstance(subject, Gaussians)
-        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth)
+        place = mesh_device(self._frame.device, subject)
+        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=place)
         shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
         cut_request = CutRequest(tolerance, budget, min_level, fade)
         request = FrameRequest(camera, cut_request, shade, cut, sensor=sensor)

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
 from v3dg import _core
+from v3dg._device import CPU, Device
 from v3dg._numbers import MOST_FLOAT, check, check_type, one_of
+from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
     from v3dg._device import HostArray
     from v3dg.gaussians import Array
+    from v3dg.scene import Subject
 
 Channel: TypeAlias = Literal[
     "depth", "median_depth", "normal", "instance", "label", "weight", "clipped"
@@ -28,6 +31,17 @@ Channel: TypeAlias = Literal[
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 MESH = -2
 """The value of the channel `instance` where a mesh without ids is strongest."""
+
+
+class _Planes(NamedTuple):
+    """The planes of a layer of meshes: float32 and int32, on one device."""
+
+    color: Array
+    depth: Array
+    coverage: Array
+    normal: Array | None
+    instance: Array | None
+    label: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +75,28 @@ class MeshLayer:
     label: Array | None = None
     light: Literal["display", "linear"] = "display"
 
-    @cached_property
-    def core(self) -> _core.Mesh:
-        """The layer for the compiled operations.
+    def core_on(self, device: Device) -> _core.Mesh:
+        """Return the layer for the compiled operations on a device.
 
         Raises:
             ValueError: A plane has the wrong shape or values.
         """
+        planes = self._planes
+        if device.is_cuda:
+            planes = _Planes(*(_on_device(plane, device) for plane in planes))
+        return _core.Mesh(
+            color=planes.color,
+            depth=planes.depth,
+            coverage=planes.coverage,
+            normal=planes.normal,
+            instance=planes.instance,
+            label=planes.label,
+            is_linear=self.light == "linear",
+        )
+
+    @cached_property
+    def _planes(self) -> _Planes:
+        """The checked planes on the host."""
         one_of(self.light, "mesh.light", ("display", "linear"))
         depth = _numbers(self.depth, "depth")
         shape = depth.shape
@@ -77,14 +106,13 @@ class MeshLayer:
         _refuse_any(depth, is_wrong, "depth", "positive finite depths where there is coverage")
         color = _numbers(self.color, "color", (*shape, 3))
         _refuse_any(color, ~np.isfinite(color), "color", "finite numbers")
-        return _core.Mesh(
+        return _Planes(
             color=color,
             depth=depth,
             coverage=coverage,
             normal=self._unit_normals(shape),
             instance=_ids(self.instance, "instance", shape),
             label=_ids(self.label, "label", shape),
-            is_linear=self.light == "linear",
         )
 
     def _coverage(self, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -101,6 +129,14 @@ class MeshLayer:
         _refuse_any(normal, ~np.isfinite(normal), "normal", "finite numbers")
         length = np.linalg.norm(normal.astype(np.float64), axis=-1, keepdims=True)
         return np.ascontiguousarray(normal / np.where(length > 0, length, 1), np.float32)
+
+
+def _on_device(plane: Array | None, device: Device) -> Array | None:
+    if plane is None:
+        return None
+    import torch
+
+    return torch.as_tensor(plane, device=str(device))
 
 
 def _array(values: Array, name: str) -> HostArray:
@@ -156,11 +192,24 @@ def _refuse_any(
     raise ValueError(f"mesh.{name}: expected {expected}, got {array[place]} at [{text}]")
 
 
+def mesh_device(device: Device, subject: Subject) -> Device:
+    """Return the device on which meshes are drawn with a subject: on CUDA, only assets
+    have channels and meshes so far."""
+    if isinstance(subject, Gaussians):
+        return device
+    return CPU
+
+
 def sensor_of(
-    channels: Sequence[Channel], mesh: MeshLayer | None, cameras: object, *, depth: bool
+    channels: Sequence[Channel],
+    mesh: MeshLayer | None,
+    cameras: object,
+    *,
+    depth: bool,
+    device: Device = CPU,
 ) -> tuple[bool, _core.Sensor | None]:
     """Return whether depth is drawn, and the request for other channels and for meshes,
-    None for neither.
+    None for neither. The planes of the mesh are placed on a device.
 
     Raises:
         TypeError: `channels` is no sequence of names, or `mesh` no `MeshLayer`.
@@ -179,7 +228,7 @@ def sensor_of(
         check_type("mesh", mesh, MeshLayer, "a MeshLayer")
         is_one = not isinstance(cameras, list | tuple)
         check("mesh", is_one, "one camera, got a list; draw with Renderer.render_batch")
-        core_mesh = mesh.core
+        core_mesh = mesh.core_on(device)
     names: list[str] = [channel for channel in channels if channel != "depth"]
     sensor = None
     if names or core_mesh is not None:

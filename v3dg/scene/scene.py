@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _device
+from v3dg import _device, _system
 from v3dg._numbers import Floats, check, check_type, one_of, positive, vector
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
@@ -35,9 +35,7 @@ from v3dg.scene.columns import (
 # This lock is held during every change of a scene, and during fork(), so that it is
 # never locked in a child process.
 _lock = threading.RLock()
-os.register_at_fork(
-    before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release
-)
+_system.at_fork(prepare=_lock.acquire, in_parent=_lock.release, in_child=_lock.release)
 
 
 class _State(NamedTuple):

@@ -7,7 +7,6 @@ import functools
 import io
 import math
 import os
-import resource
 import tempfile
 import threading
 import time
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from v3dg import _core
+from v3dg import _core, _system
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
@@ -182,7 +181,7 @@ class Tab:
             draw_ms=stats.draw_ms,
             levels=stats.levels,
             missing=stats.missing,
-            memory_bytes=_resident_bytes(),
+            memory_bytes=_system.resident_memory(),
         )
         answer = answers.Picture(
             final=is_final,
@@ -398,13 +397,3 @@ def _vector(array: npt.NDArray[np.floating]) -> answers.Vector:
 
 def _colors(colors: npt.NDArray[np.float32]) -> list[answers.Color]:
     return [(red, green, blue) for red, green, blue in to_8bit(colors).tolist()]
-
-
-def _resident_bytes(statm_path: str = "/proc/self/statm") -> int:
-    """Return the memory of this process in bytes; without /proc, return the maximum so
-    far."""
-    try:
-        with open(statm_path, encoding="ascii") as file:
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10

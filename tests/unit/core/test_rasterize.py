@@ -329,6 +329,27 @@ def test_depths_too_far_apart_for_an_entry_keep_their_order(torch):
     np.testing.assert_array_equal(*pictures)  # every pixel stops in front of the far gaussians
 
 
+@pytest.mark.parametrize("count", [300, 900, 3000, 9000])
+def test_depths_that_differ_in_their_last_bits_are_ordered(count):
+    """Lists are sorted by their leading bits first, and a far gaussian makes all others
+    alike in these. Equal depths keep the order of the array."""
+    generator = np.random.default_rng(count)
+    depths = (np.float32(2).view(np.uint32) + generator.integers(0, 40, count)).astype(np.uint32)
+    depths = np.append(depths.view(np.float32), np.float32(1e6))
+    means = np.c_[0.02 * depths[:, None] * generator.uniform(-1, 1, (count + 1, 2)), depths]
+    near = scenes.gaussians(
+        means,
+        scales=0.02 * depths[:, None] * np.ones(3),
+        opacities=0.01,
+        color=generator.uniform(size=(count + 1, 3)),
+    )
+    order = np.argsort(depths, kind="stable")
+    camera = v3dg.Camera(np.eye(4), [[64, 0, 16], [0, 64, 16], [0, 0, 1]], 32, 32)
+    np.testing.assert_array_equal(
+        draw("cpu", near, camera).color, draw("cpu", near.subset(order), camera).color
+    )
+
+
 def test_order_of_the_arrays_does_not_matter(device):
     camera = scenes.CAMERAS["off_centre"]
     gaussians = scenes.trained_like(6, camera, 300)

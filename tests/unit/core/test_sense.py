@@ -5,6 +5,7 @@ import pytest
 
 import scenes
 import v3dg
+from devices import host
 from reference import sense as reference
 
 CHANNELS = ("depth", "median_depth", "normal", "instance", "weight")
@@ -231,3 +232,37 @@ def assert_channels_or_empty(image, expected):
     np.testing.assert_allclose(
         image.median_depth[clear], expected.median_depth[clear], rtol=2e-5, atol=0
     )
+
+
+def assert_like_cpu(image, expected, planes):
+    """Pixels near a cut-off may differ, as may ids of nearly equal weights."""
+    for plane in planes:
+        got, wanted = host(getattr(image, plane)), getattr(expected, plane)
+        assert got.dtype == wanted.dtype
+        error = np.abs(got.astype(np.float64) - wanted) / np.maximum(1, np.abs(wanted))
+        assert (error > 2e-3).mean() < 0.01, plane
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("light", ["display", "linear"])
+def test_assets_have_the_channels_of_the_cpu_on_a_device(light, stop):
+    camera = scenes.CAMERAS["off_centre"]
+    asset = scenes.random_gaussians(3, camera, 400, aspect=5.0)
+    planes = ("color", "alpha", *CHANNELS)
+    options = {"channels": CHANNELS, "min_transmittance": stop, "background": (0.1, 0.2, 0.3)}
+    for mesh in (None, layer_of(mesh_in(camera, 5), light)):
+        expected = v3dg.render(asset, camera, device="cpu", mesh=mesh, **options)
+        image = v3dg.render(asset, camera, device="cuda", mesh=mesh, **options)
+        assert_like_cpu(image, expected, planes)
+
+
+@pytest.mark.gpu
+def test_a_device_refuses_what_it_cannot_draw():
+    camera = scenes.CAMERAS["plain"]
+    asset = scenes.random_gaussians(3, camera, 20)
+    with pytest.raises(ValueError, match="supported only on the CPU so far"):
+        v3dg.render(asset, camera, device="cuda", channels=("clipped",))
+    bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=0), progress=False)
+    with pytest.raises(ValueError, match="supported only on the CPU so far"):
+        v3dg.render(bundle, camera, device="cuda", channels=("normal",))

@@ -164,7 +164,7 @@ def draw_window(scene, cut, window, mesh):
         camera_at().core.window(*window),
         shade=shade_of((0.1, 0.2, 0.3), None, is_asset=False, depth=True),
         cut=_core.GivenCut(cut.instance_ids, cut.cluster_ids),
-        sensor=_core.Sensor(["median_depth", "normal", "instance", "weight"], layer.core),
+        sensor=_core.Sensor(["median_depth", "normal", "instance", "weight"], layer.core_on(CPU)),
     )
     drawing = frame.draw(residency.scene(scene, CPU).core, request, None, None, _core.Stop())
     channels = drawing.channels

@@ -1,0 +1,271 @@
+"""The core in WebAssembly decides like `v3dg.select`, and decodes pages to the same
+bits. V3DG_WASM_VIEWS sets the number of views."""
+
+import gzip
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import v3dg
+from random_bundle import random_bundle, random_gaussians
+from v3dg import _core
+from v3dg.bundle.codec import codec_of
+
+ROOT = Path(__file__).parents[2]
+WASM = ROOT / "csrc" / "wasm"
+NUM_VIEWS = int(os.environ.get("V3DG_WASM_VIEWS", "1000"))
+VIEWS_OF_A_SCENE = 50
+TYPES = {
+    "int64": "BigInt64Array",
+    "float32": "Float32Array",
+    "float64": "Float64Array",
+    "int32": "Int32Array",
+    "uint32": "Uint32Array",
+    "uint8": "Uint8Array",
+}
+
+pytestmark = [
+    pytest.mark.skipif(not WASM.is_dir(), reason="an installed package has no sources"),
+    pytest.mark.skipif(shutil.which("node") is None, reason="needs node"),
+    pytest.mark.skipif(
+        importlib.util.find_spec("ziglang") is None, reason="needs zig: pip install ziglang"
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory):
+    """The compiled module."""
+    path = tmp_path_factory.mktemp("wasm") / "v3dg.wasm"
+    subprocess.run([sys.executable, WASM / "build.py", path], check=True)
+    return path
+
+
+class Arrays:
+    """The file of arrays that node reads."""
+
+    def __init__(self):
+        self._parts = []
+        self._end = 0
+
+    def add(self, array):
+        array = np.ascontiguousarray(array)
+        data = array.tobytes() + bytes(-array.nbytes % 8)
+        place = [TYPES[array.dtype.name], self._end, array.size]
+        self._parts.append(data)
+        self._end += len(data)
+        return place
+
+    def write(self, path):
+        path.write_bytes(b"".join(self._parts))
+
+
+def tables_of(bundle, arrays, *, by_pages):
+    """Return the places of a bundle's tables; with a page table if `by_pages`."""
+    clusters = bundle.clusters
+    groups = bundle.groups
+    tables = {
+        "ball": groups.ball,
+        "weight": groups.weight,
+        "level": groups.level,
+        "ownGroup": clusters.own_group,
+        "parentGroup": clusters.parent_group,
+        "box": clusters.box,
+        "offset": clusters.offset,
+        "filter": clusters.filter_px2,
+        "antialiased": clusters.antialiased,
+    }
+    places = {name: arrays.add(array) for name, array in tables.items()}
+    pages = {"shift": np.int64, "begins": np.int32, "needs": np.uint32}
+    for name, dtype in pages.items():
+        places[name] = None
+        if by_pages and name != "begins":
+            places[name] = arrays.add(np.zeros(len(groups.weight) + 1, dtype))
+    return places
+
+
+def random_scene(rng, bundles):
+    scene = v3dg.Scene()
+    used = rng.choice(len(bundles), int(rng.integers(1, 4)), replace=False).tolist()
+    for index in used:
+        count = int(rng.choice([1, 3, 40]))
+        quaternions = rng.normal(size=(count, 4))
+        has_factors = rng.random() < 0.3
+        scene.add(
+            bundles[index],
+            rng.normal(size=(count, 3)) * 4,
+            quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+            np.exp(rng.normal(size=count)),
+            rng.choice([1.0, 1.0, 0.25, 4.0], count),
+            opacity=rng.uniform(0, 1, count) if has_factors else 1.0,
+        )
+    return scene, used
+
+
+def random_camera(rng):
+    width = int(rng.integers(16, 2000))
+    height = int(rng.integers(16, 2000))
+    eye = rng.normal(size=3) * np.exp(rng.uniform(-1, 3))
+    return v3dg.Camera.look_at(
+        eye,
+        rng.normal(size=3),
+        up=(0, 0, 1),
+        fov_x=rng.uniform(0.2, 2.2),
+        width=width,
+        height=height,
+        near=float(np.exp(rng.uniform(-6, 0))),
+    )
+
+
+def random_rule(rng):
+    """Return the arguments of `select` for a random rule."""
+    rule = {
+        "tolerance": float(rng.choice([0, np.inf, np.exp(rng.uniform(-6, 9)), 4.0])),
+        "min_level": int(rng.choice([0, 0, 0, 1, 2])),
+        "cull": bool(rng.random() < 0.8),
+    }
+    if rng.random() < 0.4:
+        rule["budget"] = int(rng.integers(0, 400))
+    if rng.random() < 0.4:
+        rule["fade"] = float(rng.choice([1.0, 1.1, 1.5, 2.0, 10.0]))
+    elif rng.random() < 0.2:
+        rule["footprint"] = "paper"
+    return rule
+
+
+def view_of(camera, rule):
+    """Return a view for core.mjs."""
+    view = {
+        "viewmat": np.asarray(camera.viewmat, np.float64).reshape(-1).tolist(),
+        "k": np.asarray(camera.K, np.float64).reshape(-1).tolist(),
+        "near": camera.near,
+        "width": camera.width,
+        "height": camera.height,
+        "tolerance": None if rule["tolerance"] == np.inf else rule["tolerance"],
+        "minLevel": rule["min_level"],
+        "culls": rule["cull"],
+        "isPaper": "footprint" in rule,
+    }
+    for name in ("budget", "fade"):
+        if name in rule:
+            view[name] = rule[name]
+    return view
+
+
+def expected_bytes(scene, camera, rule):
+    """Return what node writes for the cut of a view."""
+    try:
+        cut = v3dg.select(scene, camera, device="cpu", **rule)
+    except ValueError as error:
+        least = int(str(error).split("at least ")[1].split(",")[0])
+        return np.array([0, least, 0], np.uint32).tobytes()
+    parts = [
+        np.array([1, len(cut)], np.uint32),
+        np.array([cut.tolerance], np.float32),
+        cut.instance_ids,
+        cut.cluster_ids,
+    ]
+    if cut.given_weights is not None:
+        parts.append(cut.given_weights)
+    return b"".join(part.tobytes() for part in parts)
+
+
+def trial_scenes(rng, bundles, arrays):
+    """Yield scenes for node, each with the bytes that are expected of its views."""
+    for _ in range(-(-NUM_VIEWS // VIEWS_OF_A_SCENE)):
+        scene, used = random_scene(rng, bundles)
+        factors = scene.factors
+        instances = {
+            "bundle": arrays.add(scene.instance_bundle),
+            "positions": arrays.add(np.asarray(scene.positions, np.float64)),
+            "quaternions": arrays.add(np.asarray(scene.quaternions, np.float64)),
+            "scales": arrays.add(np.asarray(scene.scales, np.float64)),
+            "importance": arrays.add(scene.importance),
+            "factors": None if factors is None else arrays.add(factors),
+        }
+        views = []
+        expected = []
+        for _ in range(VIEWS_OF_A_SCENE):
+            camera = random_camera(rng)
+            rule = random_rule(rng)
+            views.append(view_of(camera, rule))
+            expected.append(expected_bytes(scene, camera, rule))
+        yield {"used": used, "instances": instances, "views": views}, expected
+
+
+def run_node(module, folder, arrays, trials):
+    arrays.write(folder / "arrays.bin")
+    (folder / "trials.json").write_text(json.dumps(trials))
+    program = ROOT / "tests" / "support" / "wasm_trials.mjs"
+    done = subprocess.run(
+        ["node", program, WASM / "core.mjs", module, folder],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_decisions_have_the_bits_of_select(module, tmp_path, record_property):
+    rng = np.random.default_rng(0)
+    bundles = [random_bundle(seed, num_levels=1 + seed % 5) for seed in range(24)]
+    arrays = Arrays()
+    trials = {
+        "bundles": [
+            tables_of(bundle, arrays, by_pages=seed % 2 == 1) for seed, bundle in enumerate(bundles)
+        ],
+        "scenes": [],
+        "pages": [],
+    }
+    expected = []
+    for scene, cuts in trial_scenes(rng, bundles, arrays):
+        trials["scenes"].append(scene)
+        expected += cuts
+    report = run_node(module, tmp_path, arrays, trials)
+    record_property("cuts", report["numCuts"])
+    assert report["numCuts"] == len(expected) >= NUM_VIEWS
+    got = (tmp_path / "cuts.bin").read_bytes()
+    end = 0
+    for number, cut in enumerate(expected):
+        assert got[end : end + len(cut)] == cut, f"view {number}"
+        end += len(cut)
+    assert end == len(got)
+    sizes = {len(cut) for cut in expected}
+    assert len(sizes) > 100  # the trials differ
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_pages_are_decoded_to_the_same_bits(module, tmp_path, degree):
+    gaussians = random_gaussians(np.random.default_rng(degree), 300, degree)
+    offset = np.array([0, 0, 50, 51, 178, 300], np.int64)
+    codec = codec_of("quantized", degree)
+    words = codec.encode(gaussians, offset)[0]
+    damaged = words.copy()
+    damaged[-12:] = 0x7F800000  # infinite ranges
+    arrays = Arrays()
+    page = {"offset": arrays.add(offset), "bytes": arrays.add(words.view(np.uint8))}
+    trials = {
+        "bundles": [],
+        "scenes": [],
+        "pages": [{**page, "degree": degree}],
+        "damaged": {**page, "bytes": arrays.add(damaged.view(np.uint8)), "degree": degree},
+    }
+    report = run_node(module, tmp_path, arrays, trials)
+    got = (tmp_path / "rows.bin").read_bytes()
+    assert got[:16] == _core.blake2b([words.view(np.uint8)])[0]
+    decoded = vars(codec.rounded(gaussians, offset))
+    names = ("means", "quats", "scales", "opacities", "sh")
+    assert got[16:] == b"".join(decoded[name].tobytes() for name in names)
+    assert report["refused"].endswith("of a page has invalid ranges")
+
+
+def test_the_module_is_small(module):
+    assert len(gzip.compress(module.read_bytes(), 9)) < 300_000
