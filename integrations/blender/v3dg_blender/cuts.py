@@ -80,7 +80,7 @@ def gaussians_of(cuts: Sequence[Cut]) -> list[v3dg.Gaussians]:
     with z up. SH are rotated, and opacities and tints are applied."""
     result: dict[str, v3dg.Gaussians] = {}
     for bundle in dict.fromkeys(cut.bundle for cut in cuts):
-        # All cuts of a bundle are gathered at once, so they have the bundle's SH degree.
+        # All cuts of a bundle are gathered together, so they have the same SH degree.
         of_bundle = [cut for cut in cuts if cut.bundle is bundle]
         for cut, gaussians in zip(of_bundle, _gathered(bundle, of_bundle), strict=True):
             result[cut.digest] = gaussians

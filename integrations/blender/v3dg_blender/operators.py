@@ -1,4 +1,4 @@
-"""Operators that open, update, place and save. Errors are shown as Blender's reports."""
+"""Operators that open, update, place and save. Blender reports their errors."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def _fill(block: bpy.types.ID, gaussians: v3dg.Gaussians) -> None:
     block.update_tag()
 
 
-# The property of an element that has the value of an attribute, by the attribute's type.
+# The property of an element that has its value, by the type of the attribute.
 _VALUES = {
     "FLOAT_VECTOR": "vector",
     "QUATERNION": "value",

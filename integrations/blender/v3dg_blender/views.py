@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Floats = npt.NDArray[np.float64]
 
 # For selection, a distant pinhole replaces an orthographic view. Its distance is this
-# many heights of the view, so that depths within one height change sizes by at most 1 %.
+# many heights of the view, so depths within one height change sizes by at most 1 %.
 _FAR = 100.0
 
 

@@ -57,7 +57,7 @@ _state = _State()
 
 
 def status() -> str:
-    """Return one line: counts of what is shown, or the reason why no new cut is shown."""
+    """Return one line: counts of what is shown, or why there is no new cut."""
     return _state.status
 
 

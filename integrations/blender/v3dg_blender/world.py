@@ -137,7 +137,7 @@ def _shown_copies(depsgraph: bpy.types.Depsgraph) -> list[Placed]:
 def add_instances(
     scene: v3dg.Scene, items: Sequence[bpy.types.Object], matrices: npt.ArrayLike
 ) -> None:
-    """Add objects to a scene of v3dg with the poses (I, 4, 4), which are similarities."""
+    """Add objects to a scene of v3dg, with similarities (I, 4, 4) as their poses."""
     if not items:
         return
     # Thousands of instances refer to few files, so each file is looked up only once.
