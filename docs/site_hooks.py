@@ -1,6 +1,6 @@
-"""What the site takes from elsewhere in the repository: pages from its root, recorded
-pictures, the tutorial from its notebook, and the command line's options from its
-parser. Beside the pages it writes llms.txt, an index of them for programs."""
+"""Adds parts of the repository outside of docs/ to the site: pages of its root,
+recorded pictures, the tutorial from its notebook, and the options of the command line
+from their parser. Also writes llms.txt, an index of the pages for programs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Point links at where the site has things, and fill in the command line."""
+    """Adapt links to the paths of the site, and insert the options of commands."""
     if page.file.src_uri == "command_line.md":
         markdown = markdown.replace("<!-- commands -->", "\n\n".join(map(command_text, COMMANDS)))
     home = "../" * page.file.src_uri.count("/")  # from the page to the top of the site
@@ -58,7 +58,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Make links of the pages that docstrings name."""
+    """Replace the names of pages in docstrings by links."""
     if page.file.src_uri not in ("command_line.md", "python.md"):
         return html
     return re.sub(r"\bdocs/(\w+)\.md\b", r'<a href="\1.html">\1</a>', html)
@@ -67,8 +67,8 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 def on_page_context(
     context: dict[str, Any], page: Page, config: MkDocsConfig, nav: Navigation
 ) -> dict[str, Any]:
-    """Write the text of a page beside its HTML, and with the first page llms.txt
-    (llmstxt.org): by then all pages are read."""
+    """Write the text of a page beside its HTML. With the home page, write llms.txt
+    (llmstxt.org), because all pages have been read by then."""
     site = Path(config.site_dir)
     text = site / page.file.src_uri
     text.parent.mkdir(parents=True, exist_ok=True)
@@ -79,8 +79,8 @@ def on_page_context(
 
 
 def llms_text(nav: Navigation, config: MkDocsConfig) -> str:
-    """An index of the site for programs: a section for each of the navigation, and
-    a line for each page."""
+    """Return an index of the site for programs, with a section for each section of the
+    navigation and a line for each page."""
     lines = [f"# {config.site_name}", "", f"> {config.site_description}"]
     for item in nav.items:
         if isinstance(item, Section):
@@ -89,7 +89,7 @@ def llms_text(nav: Navigation, config: MkDocsConfig) -> str:
 
 
 def llms_links(section: Section) -> list[str]:
-    """A line for each page of a section and of the sections in it."""
+    """Return a line for each page of a section and of its subsections."""
     lines = []
     for item in section.children:
         if isinstance(item, Section):
@@ -101,7 +101,7 @@ def llms_links(section: Section) -> list[str]:
 
 
 def first_sentence(markdown: str) -> str:
-    """The first sentence of the first paragraph of prose, without its markup."""
+    """Return the first sentence of the first paragraph of prose, without markup."""
     prose = re.sub(r"^```.*?^```$|<!--.*?-->", "", markdown, flags=re.M | re.S)
     for paragraph in re.split(r"\n\s*\n", prose):
         if re.match(r"[A-Za-z*`\[]", paragraph):
@@ -111,7 +111,7 @@ def first_sentence(markdown: str) -> str:
 
 
 def notebook_text(notebook: dict[str, Any]) -> str:
-    """A notebook as a page, without what its cells print."""
+    """Return a notebook as a page, without the outputs of its cells."""
     parts = []
     for cell in notebook["cells"]:
         text = "".join(cell["source"])

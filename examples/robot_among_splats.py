@@ -58,7 +58,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Part:
-    """Triangles (T, 3, 3) in the world, and what their pixels show."""
+    """Triangles (T, 3, 3) in the world, their colour and their label."""
 
     triangles: Floats
     albedo: tuple[float, float, float]  # linear light
@@ -78,7 +78,7 @@ def _halves(side: tuple[int, int, int, int]) -> tuple[tuple[int, int, int], ...]
 
 
 def limb(start: Floats, end: Floats, radius: float, end_radius: float) -> Floats:
-    """A closed cone between two points."""
+    """Return a closed cone between two points."""
     axis = (end - start) / np.linalg.norm(end - start)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     side /= np.linalg.norm(side)
@@ -104,7 +104,7 @@ def ball(center: Floats, radius: float) -> Floats:
 
 
 def robot() -> list[Part]:
-    """An arm on a base, whose forearm goes through a donut."""
+    """Return an arm on a base. Its forearm goes through a donut."""
     joints = np.array([[0, 0, 0.9], [0.1, 0, 2.3], [1.5, -0.1, 1.55], [2.15, -0.15, 1.2]])
     steel = (0.55, 0.57, 0.6)
     orange = (0.85, 0.23, 0.03)
@@ -227,7 +227,8 @@ def _layer_of(
 
 
 def make_scene(config: Config) -> v3dg.Scene:
-    """Donuts on the floor and one on the forearm; further assets behind."""
+    """Return a scene of donuts on the floor and one on the forearm. Further assets are
+    behind the robot."""
     build = v3dg.BuildConfig(steps=config.steps)
     donut = v3dg.build_bundle(make_donut(config.gaussians), config=build)
     scene = v3dg.Scene()

@@ -9,10 +9,10 @@
  * No C++ exception leaves the library. Files may be hostile: wrong ones are errors.
  *
  * Threads: several threads may call functions that take a const v3dg_scene with the same
- * scene at the same time. A function that takes a v3dg_scene without const needs the scene
- * for itself. Different scenes are independent. A cut is constant and outlives changes of
- * its scene. Selecting and reading use the threads of OpenMP, whose number is that of
- * OMP_NUM_THREADS.
+ * scene at the same time. A function that takes a v3dg_scene without const needs exclusive
+ * access to it. Different scenes are independent. A cut is constant and remains valid when
+ * its scene changes. Selection and reading use OpenMP threads; OMP_NUM_THREADS sets their
+ * number.
  *
  * Coordinates: matrices are row-major. Cameras follow the OpenCV convention, with x to the
  * right, y down and z forward. Quaternions are w, x, y, z.
@@ -74,7 +74,7 @@ typedef struct v3dg_bundle_info {
     int32_t version;      /* of the file's format */
 } v3dg_bundle_info;
 
-/* A page: the clusters that one group replaces, which are stored and read together. */
+/* A page contains the clusters that one group replaces. They are stored and read together. */
 typedef struct v3dg_page_info {
     uint64_t offset;         /* of the first byte in the bundle's file */
     uint64_t num_bytes;      /* in the file, including padding */
@@ -189,9 +189,9 @@ V3DG_API uint32_t v3dg_abi_version(void);
  * files are. It is valid until the next call of a function of this library in this thread. */
 V3DG_API const char* v3dg_last_error(void);
 
-/* Open a bundle, which becomes a scene with one instance at the origin, or the file of a
- * scene (docs/scene.md) with its bundles. Tables are read and verified at once, pages when
- * they are used. Files stay open until v3dg_close(), so replacing them changes nothing. */
+/* Open a bundle or a scene's file (docs/scene.md) with its bundles. A bundle becomes a scene
+ * with one instance at the origin. Tables are read and verified at once, and pages when they
+ * are used. Files stay open until v3dg_close(), so replacing them has no effect. */
 V3DG_API v3dg_status v3dg_open(const char* path, v3dg_scene** scene);
 
 /* Open another bundle, without an instance. `bundle` receives its index. */
@@ -225,17 +225,17 @@ V3DG_API v3dg_status v3dg_get_instances(const v3dg_scene* scene, v3dg_instance* 
 V3DG_API v3dg_status v3dg_set_instances(v3dg_scene* scene, const v3dg_instance* instances,
                                         uint64_t num_instances);
 
-/* Say which pages of a bundle are in the caller's memory: one value for each page, not 0 if
- * it is. Cuts then contain only clusters of these pages, and name those that are missing.
- * The last page must be resident, and so must the pages above each resident one. NULL
- * stands for all pages, as after opening. */
+/* Set which pages of a bundle are in the caller's memory: one value for each page, nonzero
+ * if it is. Cuts then contain only clusters of these pages, and list the missing pages. The
+ * last page must be resident, and so must the pages above each resident page. NULL means
+ * that all pages are resident, as after opening. */
 V3DG_API v3dg_status v3dg_set_resident(v3dg_scene* scene, uint32_t bundle,
                                        const uint8_t* is_resident, uint32_t num_pages);
 
 /* Choose the clusters that are just detailed enough for a camera, or for the two eyes of a
- * stereo camera (num_eyes 2), whose rotations are equal and which are pinholes. On every
- * path from a leaf of an instance to its root, the weights of the chosen clusters add up to
- * 1. The choice is that of v3dg.select in Python, on every machine. `rule` may be NULL. */
+ * stereo camera (num_eyes 2), which must be pinholes with equal rotations. On every path
+ * from a leaf of an instance to its root, the weights of the chosen clusters add up to 1.
+ * The cut is that of v3dg.select in Python, on every machine. `rule` may be NULL. */
 V3DG_API v3dg_status v3dg_select(const v3dg_scene* scene, const v3dg_camera* eyes,
                                  uint32_t num_eyes, const v3dg_rule* rule, v3dg_cut** cut);
 

@@ -36,21 +36,22 @@ class Planes:
 
 
 class Sensed:
-    """The channels of one picture (H, W), or of a batch (B, H, W), that
-    `channels` requested; docs/sensors.md defines them. A channel that was not requested
-    raises AttributeError.
+    """The requested channels of one picture (H, W) or of a batch (B, H, W).
+
+    docs/sensors.md defines them. A channel that was not requested raises
+    AttributeError.
 
     Attributes:
-        median_depth: (...) depth of the gaussian behind which at most half of the light
-            is left; 0 where more passes.
+        median_depth: (...) depth of the first gaussian behind which at most half of the
+            light is left; 0 if more passes.
         normal: (..., 3) blended normal in the axes of the camera (x right, y down, z
             forward), of length 1, or 0 where nothing is drawn.
         instance: (...) int32, the instance with the largest weight in the pixel; -1
             where nothing is drawn, `v3dg.MESH` for a mesh without ids.
         label: (...) int32, the label of that instance; -1 for none.
-        weight: (...) that weight, 0 to 1.
-        clipped: (...) bool, whether a gaussian is missing because its centre is before
-            the near plane, while its body extends into the view.
+        weight: (...) the largest weight, 0 to 1.
+        clipped: (...) bool, whether a gaussian is missing because its centre is in
+            front of the near plane, although its body extends beyond that plane.
     """
 
     @property

@@ -1,6 +1,6 @@
 // Opens bundles with the checks of the Python reader (v3dg/bundle/bundle.py), in its
-// order: the structure of the file, the tables, and at last their hash, because most
-// wrong tables are damage, which the hash explains better.
+// order: the structure of the file, the tables, and then their hash. An error of the
+// hash is preferred to one of the tables, because most wrong tables are damaged files.
 
 #include "c_interface/bundle.h"
 

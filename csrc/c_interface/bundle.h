@@ -30,8 +30,8 @@ class OpenBundle {
     int32_t level_of_cluster(size_t cluster) const { return level_[cluster]; }
     // Returns the group that made all clusters of the group above, or -1.
     int32_t parent_of_group(size_t group) const { return parent_[group]; }
-    // Returns the offset of a page's first byte in the file; of the end, for the number
-    // of pages.
+    // Returns the offset of a page's first byte in the file. If `page` is the number of
+    // pages, this is the end of the last page.
     int64_t place(size_t page) const { return places_[page]; }
 
   private:

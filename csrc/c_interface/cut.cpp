@@ -53,8 +53,8 @@ SelectRule core_rule(const v3dg_rule& rule) {
     return out;
 }
 
-// The tables of a scene's bundles with their resident pages, and what the cut needs of
-// their pages.
+// The tables of a scene's bundles with their resident pages, and the pages that the cut
+// needs.
 struct SceneTables {
     std::vector<ClusterTable> tables;
     std::vector<std::vector<uint32_t>> needs;
@@ -217,7 +217,7 @@ struct CutInstances {
     }
 };
 
-// An array of the caller, or memory of its own if the caller does not want it.
+// An array of the caller, or temporary memory if the caller passed none.
 float* array_of(float* wanted, size_t size, Buffer<float>& own) {
     return wanted == nullptr ? own.reserve(size + 1) : wanted;
 }

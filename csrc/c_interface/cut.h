@@ -1,6 +1,6 @@
 #pragma once
 
-// Selection, and reading what a cut contains.
+// Selection of cuts, and reading their gaussians.
 
 #include <v3dg.h>
 #include "c_interface/scene.h"

@@ -1,7 +1,7 @@
 #pragma once
 
-// The failures of the C library. They are exceptions inside of it, and become status
-// codes in v3dg.cpp.
+// The failures of the C library. Internally they are exceptions. v3dg.cpp converts them
+// to status codes.
 
 #include <stdexcept>
 #include <string>

@@ -1,6 +1,6 @@
-// Parses JSON with the library nlohmann/json, event by event, into a tree of values
-// that keeps whole numbers apart and refuses what the library would accept: keys that
-// occur twice, and a zero byte, which it takes for the end of the text.
+// Parses JSON into a tree of values, from the events of the library nlohmann/json. The
+// tree distinguishes whole numbers from others. Two errors are detected here, because
+// the library accepts them: keys that occur twice, and text after a zero byte.
 
 #include "c_interface/json.h"
 

@@ -45,7 +45,7 @@ std::string json_text(const Json* value);
 // Returns text of at most 60 characters; longer text ends in three dots.
 std::string shortened(const std::string& text);
 
-// Returns a string in quotation marks, with escape sequences and ASCII alone.
+// Returns a string in quotation marks, in ASCII with escape sequences.
 std::string quoted(const std::string& text);
 
 // Returns whether UTF-8 fits in one line of a message: it has no control characters and

@@ -30,8 +30,8 @@ class Node {
     // Return errors that begin with the location.
     Fault problem(const std::string& text, v3dg_status status = V3DG_ERROR_FILE) const;
     Fault error(const std::string& expected) const;
-    // Returns make(). A failure of an argument, which begins with the name of a field,
-    // becomes one of the file that begins with the location.
+    // Returns make(). Its failures of arguments, whose messages begin with the name of
+    // a field, become failures of the file, whose messages begin with the location.
     template <class Make>
     auto attempt(const Make& make) const {
         try {
@@ -44,8 +44,8 @@ class Node {
 
     bool has(const std::string& key) const { return value_->find(key) != nullptr; }
     Node field(const std::string& key) const;
-    // Returns the fields of an object, of which `required` must be there. With
-    // only_fields(), others than `required` and `optional` are errors.
+    // Returns the fields of an object, and throws if one of `required` is missing. For
+    // only_fields(), fields other than `required` and `optional` are errors, too.
     Fields fields(const std::vector<std::string>& required) const;
     Fields only_fields(const std::vector<std::string>& required,
                        const std::vector<std::string>& optional) const;

@@ -24,7 +24,7 @@ Quaternion normalised(const Quaternion& quaternion);
 // Returns the rotation by `second`, then by `first`.
 Quaternion product(const Quaternion& first, const Quaternion& second);
 
-// Returns the rotation from one axis to another, which keeps x if both are y or z.
+// Returns the rotation from one axis to another, about x if both are y or z.
 Quaternion turn_between(const std::string& up, const std::string& target);
 
 // Returns an instance with a quaternion of length one. Throws Fault for a value that

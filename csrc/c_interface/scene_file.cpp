@@ -376,7 +376,7 @@ class SceneFiles {
         return scene.up.empty() ? "z" : scene.up;
     }
 
-    // Turns the subject's axis that is up to the one of the instance, which becomes the
+    // Rotates the subject from its up axis to that of the instance, which becomes the
     // scene's.
     static void stand_upright(const Node& node, const Node& up, const std::string& own,
                               SceneContent& scene, v3dg_instance& instance) {

@@ -1,5 +1,5 @@
-// The functions of include/v3dg.h: they check pointers and indices, and turn exceptions
-// into status codes.
+// The functions of include/v3dg.h. They check pointers and indices, and convert
+// exceptions to status codes.
 
 #include <v3dg.h>
 

@@ -1,7 +1,7 @@
 #pragma once
 
-// What a sensor gives beside colour: further channels of a picture, and the picture of
-// meshes behind which gaussians are hidden. docs/sensors.md defines every channel.
+// Further channels of a picture beside colour, and the z-buffer of meshes that hide the
+// gaussians behind them. docs/sensors.md defines every channel.
 
 #include <cstddef>
 #include <cstdint>
@@ -45,7 +45,7 @@ struct SensorPlanes {
     }
 };
 
-// The light in which the colours of meshes are, and are mixed with those of gaussians.
+// The light of the colours of meshes, in which they are mixed with those of gaussians.
 enum class MeshLight { display, linear };
 
 // The z-buffer of a picture of meshes, row major.
@@ -85,7 +85,7 @@ struct Sensor {
     V3DG_HD Sensor from(size_t pixel) const { return {planes.from(pixel), mesh.from(pixel)}; }
 };
 
-// The channels that are asked for.
+// The requested channels.
 struct Channels {
     bool median_depth = false, normal = false, instance = false, label = false, weight = false,
          clipped = false;

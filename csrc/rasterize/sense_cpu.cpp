@@ -168,8 +168,8 @@ static void write_channels(const SenseTile& tile, const SenseSums& sums,
     });
 }
 
-// Ends the pixels of a tile: some reach their mesh behind all gaussians; others have a
-// hidden mesh, and become pixels without one.
+// Ends the pixels of a tile. A mesh behind all gaussians is reached now. A pixel whose
+// mesh is hidden becomes a pixel without a mesh.
 static void end_meshes(int left, int top, const Window& window, const SenseSums& sums,
                        SenseTile& tile) {
     for_each_pixel(left, top, window, [&](int p, size_t) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// Formulas of the sensor pass for one pixel, or a vector of pixels: what is summed from
-// front to back, and how the sums become channels. rasterize_math.h has alpha and the
+// Formulas of the sensor pass for one pixel, or a vector of pixels: the sums from front
+// to back, and the channels that follow from them. rasterize_math.h has alpha and the
 // stop rules, so that weights are those of the drawn colour.
 //
 // A mesh of coverage c at depth m divides the gaussians of a pixel into those in front,
@@ -22,7 +22,7 @@ namespace v3dg {
 // At a transmittance of at most this, half of the light is gone.
 constexpr float kMedianTransmittance = 0.5f;
 
-// Stands for a mesh, or for nothing, where a record is named.
+// These replace the index of a record for a mesh, or for nothing.
 constexpr uint32_t kMeshRecord = ~0u;
 
 // Returns the median depth of a pixel after a gaussian. `before` is the median depth up
@@ -68,7 +68,7 @@ V3DG_HD V3DG_INLINE SensedShares shares_of(float t, float min_transmittance,
             .alpha = (1 - mesh.coverage) * (1 - pixel.transmittance) + mesh.coverage};
 }
 
-// Whose weight is the largest in a pixel: a record, the mesh, or nothing.
+// The owner of the largest weight in a pixel: a record, the mesh, or nothing.
 struct Strongest {
     float weight;
     uint32_t record;  // kMeshRecord: the mesh if the weight is positive
@@ -199,7 +199,7 @@ V3DG_HD V3DG_INLINE void write_pixel(const SensedPixel& pixel, size_t at, float 
 }
 
 // Computes the normal of a gaussian in view space: its shortest axis, the first one of
-// equals, turned towards the eye. `p` is the gaussian's mean in view space.
+// equals, pointing towards the eye. `p` is the gaussian's mean in view space.
 V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float scale[3],
                                             const ModelView<float>& view, const float p[3],
                                             float normal[3]) {
@@ -216,8 +216,8 @@ V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float sca
     for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] * factor : 0.0f;
 }
 
-// A gaussian that is not drawn because its mean is before the near plane, and whose
-// body, in which its alpha in space is at least 1/255, extends beyond that plane.
+// A gaussian that is not drawn because its mean is before the near plane, although its
+// body extends beyond that plane. In the body, the alpha in space is at least 1/255.
 struct ClippedBody {
     double mean[3];     // in view space
     double to_unit[9];  // row major; maps the body to a ball

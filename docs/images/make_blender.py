@@ -59,7 +59,7 @@ def write_world(path: Path, donut: str, oak: str) -> None:
 
 
 def add_ground_and_light(scene: bpy.types.Scene) -> None:
-    """Add a plane, which the gaussians shade, a sun and a sky."""
+    """Add a plane on which the gaussians cast shadows, a sun and a sky."""
     corners = [(-300, -50, 0), (300, -50, 0), (300, 600, 0), (-300, 600, 0)]
     mesh = bpy.data.meshes.new("ground")
     mesh.from_pydata(corners, [], [(0, 1, 2, 3)])

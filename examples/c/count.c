@@ -1,7 +1,7 @@
-/* Counts what a cut contains: v3dg_count FILE [TOLERANCE [BUDGET]]
+/* Counts the clusters and gaussians of a cut: v3dg_count FILE [TOLERANCE [BUDGET]]
  *
  * FILE is a bundle (.v3dg) or a scene (.json). The camera is the first one of the scene's
- * file, or stands three units before the origin. Nothing is drawn. */
+ * file, or else one that is three units from the origin. Nothing is drawn. */
 
 #include <inttypes.h>
 #include <stdio.h>

@@ -1,9 +1,9 @@
 /* Feeds the arrays of an engine: v3dg_engine_arrays FILE OUTPUT
  *
- * An engine has memory for a fixed number of pages. In each frame it selects a cut of the
- * pages that it has, and reads the most urgent pages that the cut misses. When nothing is
- * missing, the positions, scales, rotations and colours of the cut are arrays that any
- * splat renderer takes. They are written to OUTPUT as a .ply of points, to be looked at. */
+ * An engine has memory for a fixed number of pages. In each frame it selects a cut of its
+ * resident pages, and reads the most urgent missing pages. When no page is missing, the
+ * positions, scales, rotations and colours of the cut are arrays for any renderer of
+ * gaussians. They are written to OUTPUT as a .ply file of points for a viewer. */
 
 #include <inttypes.h>
 #include <stdint.h>
@@ -14,7 +14,7 @@
 
 enum { MOST_FRAMES = 1000, PAGES_A_FRAME = 8, BUDGET = 200000 };
 
-/* The arrays of an engine, as many of its components want them. */
+/* The arrays of an engine. */
 typedef struct arrays {
     uint64_t count;
     float* positions; /* x, y, z in the world */
@@ -52,7 +52,7 @@ static uint8_t** first_pages(v3dg_scene* scene, uint32_t num_bundles) {
     return is_resident;
 }
 
-/* Reads a page, where an engine would copy it to its memory, and marks it as resident. */
+/* Reads a page and marks it as resident. An engine would copy it to its memory here. */
 static void load(v3dg_scene* scene, v3dg_missing_page missing, uint8_t** is_resident) {
     v3dg_bundle_info bundle;
     v3dg_page_info page;
@@ -66,7 +66,7 @@ static void load(v3dg_scene* scene, v3dg_missing_page missing, uint8_t** is_resi
     check(v3dg_set_resident(scene, missing.bundle, is_resident[missing.bundle], bundle.num_pages));
 }
 
-/* Selects frame by frame until no page is missing that the cut needs now. */
+/* Selects a cut in each frame, until no page is missing that the cut needs now. */
 static v3dg_cut* settled_cut(v3dg_scene* scene, const v3dg_camera* camera, uint8_t** is_resident) {
     v3dg_rule rule = V3DG_DEFAULT_RULE;
     rule.fade = 1.02;

@@ -1,4 +1,4 @@
-"""What the hooks of the site make: llms.txt, and the tutorial from its notebook."""
+"""Tests the files that the hooks of the site write: llms.txt and the tutorial."""
 
 import importlib.util
 import re
@@ -24,7 +24,7 @@ def hooks():
 
 @pytest.fixture(scope="module")
 def llms(hooks):
-    """The text of llms.txt for the site as it is."""
+    """Return the text of llms.txt for the current site."""
     config = load_config(str(ROOT / "mkdocs.yml"))
     files = config.plugins.run_event("files", get_files(config), config=config)
     nav = get_navigation(files, config)

@@ -1,6 +1,6 @@
 // Coverage-guided fuzzer of the C library, for libFuzzer (tests/fuzz/run.py builds and
 // starts it). Inputs that begin with "{" are scenes, which refer to the bundle a.v3dg in
-// the working folder; others are bundles, whose hashes are made to fit.
+// the working folder. Other inputs are bundles, and their hashes are corrected.
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
@@ -36,7 +36,7 @@ uint64_t number_at(const std::string& data, uint64_t place) {
     return number;
 }
 
-// Writes the hash of `message` at a place.
+// Writes the hash of `message` to an address.
 void put_hash(const std::string& message, std::string& data, uint64_t place) {
     v3dg::Blake2b hash;
     hash.add(reinterpret_cast<const unsigned char*>(message.data()), message.size());
@@ -54,7 +54,7 @@ void put_hash_of_pieces(const std::string& message, std::string& data, uint64_t 
     put_hash(digests, data, place);
 }
 
-// Makes the hashes of pages and of the file fit, as far as the header leads to them.
+// Corrects the hashes of the file and of all pages that the header describes.
 void make_hashes_fit(std::string& data) {
     if (data.size() < 8) return;
     const uint64_t header_bytes = number_at(data, 0);

@@ -1,12 +1,13 @@
-"""Fuzz the .ply reader or the C library, which are C++, for some time, and keep the
-inputs that reach all that was reached.
+"""Fuzz the .ply reader or the C library, which are C++, for some time, and store the
+inputs that together reach all of the code that was reached.
 
     python tests/fuzz/run.py SECONDS [ply | c_library]
 
-It is guided by coverage and needs clang++ (CLANG names another one), and for the C
-library nlohmann/json.hpp. It works in build/fuzz; what stops it is there as crash-*.
-Inputs go to tests/fuzz/corpus, which attack/test_fuzz.py and, for the C library,
-unit/c_interface/test_c_files.py replay. What is not C++ is attack.py's.
+The fuzzers are guided by coverage. They need clang++ (CLANG names another compiler),
+and for the C library nlohmann/json.hpp. They work in build/fuzz and write inputs that
+crash to crash-* in that folder. Other inputs are stored in tests/fuzz/corpus, and
+attack/test_fuzz.py replays them; for the C library, unit/c_interface/test_c_files.py
+does so. attack.py fuzzes the code that is not C++.
 """
 
 import argparse

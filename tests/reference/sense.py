@@ -1,5 +1,5 @@
-"""The channels of a sensor in float64: every gaussian against every pixel, front to
-back, among meshes."""
+"""Computes the channels of a sensor in float64, with and without meshes: blends every
+gaussian in every pixel, front to back."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class Sensed:
     depth: np.ndarray  # (H,W)
     median_depth: np.ndarray  # (H,W)
     normal: np.ndarray  # (H,W,3)
-    normal_length: np.ndarray  # (H,W) before it becomes 1
-    strongest: np.ndarray  # (H,W) gaussian; -1 nothing, -2 the mesh
-    weight: np.ndarray  # (H,W)
-    second_weight: np.ndarray  # (H,W) of the next strongest
-    # (H,W) how far a transmittance is from a half, an alpha from a cut-off, or a
-    # transmittance from where the pixel stops: below a band, rounding decides.
+    normal_length: np.ndarray  # (H,W) length of the normal before it is normalised
+    strongest: np.ndarray  # (H,W) index of the gaussian; -1: nothing, -2: the mesh
+    weight: np.ndarray  # (H,W) largest weight
+    second_weight: np.ndarray  # (H,W) second largest weight
+    # (H,W) smallest relative distance of a transmittance from a half or from the stop
+    # limit, or of an alpha from the cut-off. If it is small, rounding decides.
     margin: np.ndarray
 
 
 def normals(gaussians, camera):
-    """(N,3) in view space: the shortest axis, turned towards the eye."""
+    """Return the normals (N,3) in view space: the shortest axes, facing the eye."""
     axes = rotation(gaussians.quats)
     shortest = np.argmin(np.asarray(gaussians.scales, np.float64), axis=1)
     axis = axes[np.arange(len(shortest)), :, shortest] @ camera.viewmat[:3, :3].T
@@ -60,19 +60,20 @@ def display(x):
 
 @dataclass(frozen=True)
 class Blended:
-    """A pixel without a mesh, front to back."""
+    """The blended gaussians of a pixel without a mesh, front to back."""
 
-    weights: np.ndarray  # (N,) before they are filled up
+    weights: np.ndarray  # (N,) weights, not yet multiplied by the gain
     left: np.ndarray  # (N,) transmittance behind each gaussian
-    stopped: int  # the gaussian at which the pixel stopped; N if it did not
+    stopped: int  # index of the gaussian at which the pixel stopped; N if it did not
     end: float  # transmittance behind all gaussians
-    gain: float  # factor that fills up the weights
-    margin: float  # how near a transmittance was to the one at which pixels stop
+    gain: float  # factor that makes the sum of the weights 1 after a stop
+    margin: float  # smallest relative distance of a transmittance from the stop limit
 
 
 def blended(alphas, stop, fills) -> Blended:
-    """`fills`: the pixel stops behind the gaussian that leaves `stop` or less, and its
-    weights are filled up; else it stops before that gaussian."""
+    """Blend the gaussians of a pixel until a transmittance is at most `stop`. If
+    `fills` is true, the last gaussian is included and the weights are scaled to a sum
+    of 1; otherwise the last gaussian is left out."""
     weights, left = np.zeros(len(alphas)), np.zeros(len(alphas))
     transmittance, stopped, margin = 1.0, len(alphas), np.inf
     for i, alpha in enumerate(alphas):
@@ -96,7 +97,7 @@ def blended(alphas, stop, fills) -> Blended:
 def sense(
     gaussians, camera, *, mesh=None, background=(0, 0, 0), min_transmittance=None, light="display"
 ) -> Sensed:
-    """Draw without a filter, as an asset is drawn."""
+    """Draw an asset, without a low-pass filter."""
     stop = TRANSMITTANCE_MIN if min_transmittance is None else min_transmittance
     projection = project(gaussians, camera)
     colors = reference_sh.color(gaussians.sh, np.asarray(gaussians.means) - camera.position, None)
@@ -156,7 +157,8 @@ def sense(
 
 
 def _alphas(gaussians, projection, order, x, y):
-    """Return (N,) alphas of a pixel, and how near one of them is to the cut-off."""
+    """Return the alphas (N,) in a pixel, and the smallest relative distance of one of
+    them from the cut-off."""
     a = projection.covariance_px2[order, 0, 0]
     b = projection.covariance_px2[order, 0, 1]
     dx = x - projection.mean_px[order, 0]
@@ -168,8 +170,8 @@ def _alphas(gaussians, projection, order, x, y):
 
 
 def _mixed(plain, front, mesh_color, coverage, passed, light):
-    """`coverage` parts of a pixel in which the mesh hides all behind it, the rest of a
-    pixel without a mesh."""
+    """Return the mixture of `coverage` parts of a pixel in which the mesh hides the
+    gaussians behind it, and 1 - `coverage` parts of the pixel without the mesh."""
     if coverage == 0:
         return plain
     if light == "display":
@@ -181,8 +183,9 @@ def _mixed(plain, front, mesh_color, coverage, passed, light):
 
 
 def clipped(gaussians, camera):
-    """(H,W) whether the ray of a pixel, from the near plane on, meets the body of a
-    gaussian whose centre is before that plane; and how near one is to the limit."""
+    """Return (H,W) whether the ray of a pixel, beyond the near plane, meets the body of
+    a gaussian whose centre is before that plane. Also return the smallest relative
+    distance of an alpha from the limit of bodies."""
     to_view, origin = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     view = np.asarray(gaussians.means, np.float64) @ to_view.T + origin
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5

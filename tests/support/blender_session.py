@@ -1,7 +1,7 @@
-"""What the add-on does inside Blender: a function for each behaviour, run by
-test_blender.py with a Python that has bpy, in a folder of its own.
+"""Tests the add-on inside Blender, with a function for each behaviour. test_blender.py
+runs this file in an empty folder with a Python that has bpy.
 
-Prints the name of each function and why it failed, or "", as JSON.
+Prints the name and the error of each function as JSON. "" means success.
 """
 
 import importlib
@@ -182,7 +182,7 @@ def instances_with_equal_cuts_share_a_data_block():
     blocks = {item.data.name for item in items}
     assert len(splats.data_blocks()) == len(blocks)
     assert shown.num_blocks < shown.num_instances / 2
-    # Of two appearances there are two data blocks, which differ.
+    # Instances of two appearances have two different data blocks.
     far = items[-1]
     near_twin = next(item for item in items[:-1] if item.data == far.data)
     far.v3dg.tint = (0.5, 1, 1)
@@ -192,7 +192,7 @@ def instances_with_equal_cuts_share_a_data_block():
     name = "radiance:base" if splats.has_splats() else "radiance"
     ratio = values(far.data, name)[:, 3] / values(near_twin.data, name)[:, 3]
     np.testing.assert_allclose(ratio, 0.5, rtol=1e-6)
-    # Nothing of earlier cuts is left.
+    # Data blocks of earlier cuts are removed.
     for item in items:
         item.v3dg.importance = 1e-3
     bpy.context.scene.v3dg.render_budget = 8_000
@@ -201,7 +201,7 @@ def instances_with_equal_cuts_share_a_data_block():
 
 
 def viewport_at(camera):
-    """Return a viewport that looks as a camera does; there is no window here."""
+    """Return a viewport with the view of a camera, in place of one in a window."""
     view = views.render_camera(bpy.context.scene, camera, depsgraph())
     window = camera.calc_matrix_camera(depsgraph(), x=view.width, y=view.height)
     looking = camera.matrix_world.normalized().inverted()
@@ -315,7 +315,7 @@ def a_scene_comes_back_as_it_was_saved():
         np.testing.assert_allclose(
             getattr(saved, name)[order], getattr(upright, name)[expected_order], rtol=1e-6
         )
-    # The camera sees what it has seen: its size is that of the render.
+    # The camera has the same view as before, and the size of the render.
     assert list(cameras) == ["front"]
     np.testing.assert_allclose(cameras["front"].K, view.K, rtol=1e-5)
     seen = in_view(cameras["front"], saved.positions[order])
@@ -344,7 +344,7 @@ def empties_and_copies_are_saved():
     assert len(world.instances(bpy.context.scene)) == 4
     # An empty with a bundle is an instance of the scene file, too.
     empties[2].v3dg.bundle = path
-    # A collection is placed twice, and itself left out of renders.
+    # A collection is placed twice, and the collection itself is not rendered.
     collection = bpy.data.collections.new("parts")
     bpy.context.scene.collection.children.link(collection)
     part = world.new_instance(path, mathutils.Matrix.Translation((0, 0, 5)), collection)
@@ -460,7 +460,7 @@ def a_scene_without_instances_can_be_opened_shown_and_saved():
     assert watch.status() == "0 gaussians of 0 instances in 0 data blocks"
     bpy.ops.v3dg.save_scene(filepath=os.path.abspath("out.json"))
     assert len(v3dg.Scene.load("out.json")) == 0
-    # Neither is anything shown when all instances are hidden.
+    # Nothing is shown if all instances are hidden.
     bpy.ops.v3dg.open(filepath=make_bundle("ball.v3dg"))
     item = bpy.context.object
     item.hide_viewport = True
@@ -565,7 +565,7 @@ def cameras_see_what_blender_sees():
 
 @check
 def a_render_shows_the_cut_of_its_camera_in_the_colours_of_the_asset():
-    # Before 5.3, colours are the same from all sides.
+    # Before 5.3, colours do not depend on the direction of view.
     sh_degree = 2 if splats.has_splats() else 0
     path = make_bundle("ball.v3dg", count=400, sh_degree=sh_degree, opacity=0.999)
     bpy.ops.v3dg.open(filepath=path)
@@ -593,7 +593,7 @@ def a_render_shows_the_cut_of_its_camera_in_the_colours_of_the_asset():
     world.add_instances(expected, [item], world.nearest_similarities(matrix))
     image = v3dg.render(expected, lens, budget=300, device="cpu")
     truth = np.clip(image.color, 0, 1)
-    # Where gaussians are not opaque, v3dg blends in sRGB and Blender in linear colours.
+    # Transparent pixels differ: v3dg blends in sRGB, and Blender in linear colours.
     is_opaque = image.alpha.reshape(30, 40) > 0.97
     assert is_opaque.sum() > 200
     means = pixels[is_opaque].mean(0)

@@ -1,4 +1,4 @@
-"""The C library for tests: it is built once, and its functions are called by ctypes."""
+"""Builds the C library once for all tests, and calls its functions through ctypes."""
 
 import contextlib
 import ctypes
@@ -163,8 +163,8 @@ class Failure(Exception):
 
 @functools.cache
 def json_folder():
-    """Return the folder with nlohmann/json.hpp: that of the package from PyPI, else the
-    system's, for which CMake looks."""
+    """Return the folder with nlohmann/json.hpp of the package from PyPI. None means
+    that CMake searches the folders of the system."""
     package = importlib.util.find_spec("nlohmann_json")
     if package is None:
         return None
@@ -172,7 +172,7 @@ def json_folder():
 
 
 def configure(build, *options):
-    """Configure the C library alone, in a folder."""
+    """Configure a build of the C library without the Python module."""
     arguments = [
         "-DV3DG_PYTHON=OFF",
         "-DV3DG_C_LIBRARY=ON",
@@ -189,7 +189,7 @@ def configure(build, *options):
 
 @contextlib.contextmanager
 def building():
-    """Let one process at a time build in the shared folder."""
+    """Hold the lock of the shared build folder, so that only one process builds."""
     BUILD.mkdir(parents=True, exist_ok=True)
     with open(BUILD / "lock", "w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -198,7 +198,7 @@ def building():
 
 @functools.cache
 def built():
-    """Build the library, as far as sources have changed; return the build folder."""
+    """Build the library from the sources that have changed. Return the build folder."""
     if shutil.which("cmake") is None or shutil.which("ninja") is None:
         pytest.skip("needs cmake and ninja")
     with building():
@@ -210,7 +210,7 @@ def built():
 
 @functools.cache
 def library():
-    """Return the library, whose functions raise Failure."""
+    """Return the loaded library. `call` raises its errors as Failure."""
     loaded = ctypes.CDLL(str(built() / "lib" / "libv3dg.so"))
     loaded.v3dg_last_error.restype = c_char_p
     loaded.v3dg_close.argtypes = [ctypes.c_void_p]
@@ -226,7 +226,7 @@ def library():
 
 
 def call(name, *arguments):
-    """Call a function that returns a status; raise Failure for any but V3DG_OK."""
+    """Call a function, and raise Failure unless it returns V3DG_OK."""
     status = getattr(library(), name)(*arguments)
     if status != OK:
         raise Failure(status, library().v3dg_last_error().decode("utf-8", "replace"))
@@ -330,7 +330,7 @@ class CScene:
 
 
 def empty_rows(count, sh_degree):
-    """Return arrays with room for gaussians: means, quats, scales, opacities, sh."""
+    """Return arrays of means, quats, scales, opacities and sh, filled with NaN."""
     bases = (sh_degree + 1) ** 2
     return tuple(
         np.full((count, *row), np.nan, np.float32) for row in ((3,), (4,), (3,), (), (bases, 3))
@@ -388,8 +388,8 @@ def c_rule(tolerance=None, budget=None, min_level=0, fade=None, *, cull=True):
 
 
 def c_instances(scene, bundle_numbers):
-    """Return the instances of a scene of v3dg; bundle_numbers has the index in the C
-    scene of each of its bundles."""
+    """Return the instances of a scene of v3dg for the C library. bundle_numbers maps
+    indices of its bundles to indices of bundles in the C scene."""
     return [
         Instance(
             (3 * c_double)(*scene.positions[i]),

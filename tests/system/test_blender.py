@@ -1,13 +1,13 @@
-"""The add-on for Blender, inside Blender: blender_session.py has the behaviours.
+"""Runs the tests of the add-on inside Blender, which are in blender_session.py.
 
-Blender as a Python module is large and wants one version of Python, so it is looked for
-in this Python, else in the one that V3DG_BLENDER_PYTHON names:
+Blender as a Python module is large and needs a certain version of Python. So these
+tests use the Python that V3DG_BLENDER_PYTHON names if this one has no module bpy:
 
     python3.13 -m venv blender
     blender/bin/pip install bpy pillow tqdm tyro zstandard
     V3DG_BLENDER_PYTHON=blender/bin/python pytest tests/system/test_blender.py
 
-That Python imports v3dg from where it is installed, else from beside its sources.
+That Python imports the installed v3dg, or else the one beside these sources.
 """
 
 import ast
@@ -41,7 +41,7 @@ def names_of_checks():
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """Why each check failed, or "", by its name. Blender runs once for all."""
+    """Return the error of each check, or "", by its name. Blender is started once."""
     folder = tmp_path_factory.mktemp("blender")
     done = subprocess.run(
         [PYTHON or sys.executable, str(SESSION)],

@@ -1,5 +1,5 @@
-"""The parts of the core that differ between systems compile for Windows and macOS, and
-the same program prints the same on this system for every number of threads."""
+"""The parts of the core that differ between systems compile for Windows and macOS. On
+this system, the output of the same program does not depend on the number of threads."""
 
 import importlib.util
 import os

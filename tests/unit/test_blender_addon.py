@@ -1,4 +1,4 @@
-"""The parts of the add-on for Blender that need no Blender: cameras, cuts, the pace,
+"""Tests the parts of the Blender add-on that need no Blender: cameras, cuts, the pace,
 and its archive."""
 
 import importlib.util
@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parents[2] / "integrations" / "blender"
 
 
 def load(name):
-    """Import a file of the add-on without the package around it, which needs bpy."""
+    """Import a file of the add-on without its package, which needs bpy."""
     spec = importlib.util.spec_from_file_location(f"blender_{Path(name).stem}", FOLDER / name)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -51,7 +51,7 @@ def perspective(fx, fy, cx, cy, width, height):
 
 
 def clip_pixels(view_from_world, projection, points, width, height):
-    """Return (N, 2) where OpenGL draws points, v down."""
+    """Return the pixels (N, 2) at which OpenGL draws points, with v down."""
     matrix = projection @ view_from_world
     clip = np.column_stack([points, np.ones(len(points))]) @ matrix.T
     device = clip[:, :2] / clip[:, 3:]
@@ -91,7 +91,7 @@ def test_an_orthographic_view_is_seen_from_afar():
     projection[:2, 3] = (0.1, -0.2)
     camera = views.camera_of_projection(view_matrix(), projection, 300, 200, 0.1)
     expected = clip_pixels(view_matrix(), projection, points, 300, 200)
-    # Depths of the points differ by a hundredth of the distance of the eye.
+    # Depths of the points differ by 1 % of the distance to the eye.
     np.testing.assert_allclose(camera_pixels(camera, points), expected, atol=0.01 * 300)
 
 

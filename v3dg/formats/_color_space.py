@@ -1,5 +1,4 @@
-"""Converts colours of gaussians that are stored as linear light to sRGB, in which
-gaussians are blended."""
+"""Converts linear colours of gaussians to sRGB, in which gaussians are blended."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +7,10 @@ from v3dg import _core
 from v3dg._numbers import Floats
 from v3dg.gaussians import Gaussians
 
-# Number of directions in which converted colours are fitted by spherical harmonics:
-# enough for 16 coefficients.
+# Number of directions in which spherical harmonics are fitted to converted colours. It
+# is several times the number of coefficients, 16.
 _NUM_DIRECTIONS = 64
-# Number of gaussians that are fitted together, small enough that their colours stay in
-# the cache.
+# Number of gaussians that are fitted together. Their colours fit into the cache.
 _FITTED_AT_ONCE = 1 << 12
 
 
@@ -24,8 +22,8 @@ def conversion_note(name: str) -> str:
 
 
 def srgb_from_linear(gaussians: Gaussians) -> Gaussians:
-    """Return gaussians whose linear colours are converted to sRGB. Spherical harmonics
-    are fitted to the converted colours in directions all around."""
+    """Return the gaussians with their linear colours converted to sRGB. Spherical
+    harmonics are fitted to the converted colours in directions over the sphere."""
     bases = _core.sh_bases(gaussians.sh_degree, _directions())
     inverse = np.linalg.pinv(bases)
 
@@ -46,7 +44,7 @@ def srgb_from_linear(gaussians: Gaussians) -> Gaussians:
 
 
 def _directions() -> Floats:
-    """Return (D, 3) unit vectors that are evenly distributed: a Fibonacci lattice."""
+    """Return (D, 3) evenly distributed unit vectors, a Fibonacci lattice."""
     steps = np.arange(_NUM_DIRECTIONS)
     z = 1 - (2 * steps + 1) / _NUM_DIRECTIONS
     angles = steps * np.pi * (3 - np.sqrt(5))

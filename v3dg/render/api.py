@@ -127,14 +127,14 @@ def render(
             0.001 from 9.5 px² on, where levels differ by more; with a budget, by the
             tolerance that meets it. Assets are then drawn as by `v3dg.rasterize`.
         depth: Whether to draw the expected depth, too.
-        channels: Names of channels that are drawn beside colour and alpha, and are then
+        channels: Names of channels that are drawn beside colour and alpha, and become
             attributes of the picture: "depth" (as `depth=True`), "median_depth",
-            "normal", "instance", "label", "weight", "clipped" (docs/sensors.md). All
-            but "depth" only on the CPU so far, or for an asset; "clipped" only on the
-            CPU and for pinholes.
-        mesh: Picture of meshes of the same size, for one camera: its pixels hide what
-            is behind them. Colour, alpha and the channels are those of gaussians and
-            meshes together. Only on the CPU so far, or for an asset.
+            "normal", "instance", "label", "weight", "clipped" (docs/sensors.md). On
+            CUDA devices, only "depth" is supported for scenes and bundles, and all but
+            "clipped" for assets. "clipped" needs a pinhole.
+        mesh: Picture of meshes of the same size, for one camera. Its pixels hide the
+            gaussians behind them. Colour, alpha and channels include gaussians and
+            meshes. On CUDA devices, it is supported only for assets.
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what
             the next picture of the same scene or bundle needs; a `Renderer` controls

@@ -184,8 +184,8 @@ class Renderer:
             tolerance: As in `v3dg.select`; so are `min_level` and `fade`. A batch has
                 no budget.
             background: As in `v3dg.render`; so are `min_transmittance` and `depth`.
-            channels: As in `v3dg.render`; only on the CPU so far, as is `mesh`. New
-                arrays are made for them.
+            channels: As in `v3dg.render`. On CUDA devices, batches support neither
+                channels other than depth nor `mesh`. Channels are always new arrays.
             mesh: As in `v3dg.render`, with planes (B, H, W).
             out: Where to write; None for new arrays of colour, alpha and, if requested,
                 depth. They belong to the caller, and are valid once the result was read

@@ -1,5 +1,5 @@
-"""Channels of pictures beside colour, and layers of meshes among which gaussians are
-drawn. docs/sensors.md defines them."""
+"""Channels of pictures beside colour, and layers of meshes that are combined with
+gaussians. docs/sensors.md defines them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Channel: TypeAlias = Literal[
 
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 MESH = -2
-"""The value of the channel `instance` where a mesh without ids is strongest."""
+"""The value of the channel `instance` if a mesh without ids has the largest weight."""
 
 
 class _Planes(NamedTuple):
@@ -46,25 +46,25 @@ class _Planes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeshLayer:
-    """The z-buffer of a picture of meshes, from any renderer, for the same camera:
-    gaussians behind the meshes are hidden, and those in front are blended over them.
+    """A picture of meshes with its z-buffer, from any renderer, for the same camera.
 
-    The planes are (H, W) for one camera, or (B, H, W) for a batch: arrays, or torch
-    tensors, which are copied to the host.
+    Gaussians behind the meshes are hidden, and those in front are blended over them.
+    The planes are (H, W) for one camera, or (B, H, W) for a batch. They are arrays, or
+    torch tensors, which are copied to the host.
 
     Attributes:
         color: (..., 3) colour of the meshes, not multiplied by coverage.
         depth: (...) depth of the meshes along the camera's axis, in world units. A
             gaussian is in front if the depth of its centre is smaller.
-        coverage: (...) from 0 to 1, the part of the pixel that meshes cover. None
-            means 1 where the depth is positive and finite, else 0.
-        normal: (..., 3) in the axes of the camera (x right, y down, z forward); they
-            are normalised. None: meshes contribute no normals.
+        coverage: (...) fraction of the pixel that meshes cover, 0 to 1. None means 1
+            where the depth is positive and finite, else 0.
+        normal: (..., 3) normals in the axes of the camera (x right, y down, z forward),
+            of any length. None means that meshes contribute no normals.
         instance: (...) whole numbers for the channel `instance`; None means `MESH`.
         label: (...) whole numbers for the channel `label`; None means -1.
         light: The light of `color`, in which meshes and gaussians are mixed: "display"
-            (sRGB, as gaussians are trained) or "linear". The picture is in display
-            light with both.
+            (sRGB, in which gaussians are trained) or "linear". The resulting picture is
+            in display light in both cases.
     """
 
     color: Array
@@ -96,7 +96,7 @@ class MeshLayer:
 
     @cached_property
     def _planes(self) -> _Planes:
-        """The checked planes on the host."""
+        """Return the planes on the host, after checking them."""
         one_of(self.light, "mesh.light", ("display", "linear"))
         depth = _numbers(self.depth, "depth")
         shape = depth.shape
@@ -184,7 +184,7 @@ def _ids(values: Array | None, name: str, shape: tuple[int, ...]) -> npt.NDArray
 def _refuse_any(
     array: npt.NDArray[np.generic], is_wrong: npt.NDArray[np.bool_], name: str, expected: str
 ) -> None:
-    """Raise ValueError that names the first wrong value and its place."""
+    """Raise a ValueError that names the first wrong value and its index."""
     if not is_wrong.any():
         return
     place = tuple(int(number[0]) for number in np.nonzero(is_wrong))
@@ -193,8 +193,8 @@ def _refuse_any(
 
 
 def mesh_device(device: Device, subject: Subject) -> Device:
-    """Return the device on which meshes are drawn with a subject: on CUDA, only assets
-    have channels and meshes so far."""
+    """Return the device on which meshes are drawn with a subject. On CUDA, channels and
+    meshes are supported only for assets so far."""
     if isinstance(subject, Gaussians):
         return device
     return CPU
@@ -208,13 +208,14 @@ def sensor_of(
     depth: bool,
     device: Device = CPU,
 ) -> tuple[bool, _core.Sensor | None]:
-    """Return whether depth is drawn, and the request for other channels and for meshes,
-    None for neither. The planes of the mesh are placed on a device.
+    """Return whether depth is drawn, and the request for other channels and meshes, or
+    None without any. The planes of the mesh are copied to a device.
 
     Raises:
-        TypeError: `channels` is no sequence of names, or `mesh` no `MeshLayer`.
-        ValueError: A channel is unknown, a plane of the mesh is invalid, or there is a
-            mesh for a list of cameras.
+        TypeError: `channels` is not a sequence of names, or `mesh` is not a
+            `MeshLayer`.
+        ValueError: A channel is unknown, a plane of the mesh is invalid, or a mesh is
+            given for a list of cameras.
     """
     if isinstance(channels, tuple) and not channels and mesh is None:
         return bool(depth), None  # fast path for most pictures

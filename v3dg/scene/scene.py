@@ -157,8 +157,8 @@ class Scene:
             environment: (I,) or one whole number for all, 0 to 2^24 - 1: the cameras of
                 that environment see the instance (see `CameraBatch.environments`); -1:
                 those of all do. Pictures of a single `Camera` show all instances.
-            label: (I,) or one whole number for all, >= 0: what the channel `label` of a
-                picture shows, such as the class of the object; -1: none.
+            label: (I,) or one whole number for all, >= 0: the value in the channel
+                `label` of a picture, such as the class of the object; -1: none.
 
         Raises:
             TypeError: ``bundle`` is not a Bundle.

@@ -1,4 +1,4 @@
-/* Prints the sizes of the structs of v3dg.h, where their fields are, and its constants. */
+/* Prints the sizes of the structs of v3dg.h, the offsets of their fields, and constants. */
 
 #include <stddef.h>
 #include <stdio.h>

@@ -1,8 +1,8 @@
-"""The binary interface of the C library is the committed one: its symbols, its structs
-and its constants.
+"""Compares the binary interface of the C library with the committed one: its symbols,
+structs and constants.
 
-After a change that is meant, raise V3DG_ABI_VERSION (unless functions were only added)
-and write the new list with `PYTHONPATH=tests/support python` and this file.
+After an intended change, raise V3DG_ABI_VERSION (unless functions were only added), and
+write the new list: run this file with `PYTHONPATH=tests/support python`.
 """
 
 import ctypes
@@ -31,7 +31,7 @@ def compiler():
 
 
 def exported():
-    """Return kind and name of all that the library exports."""
+    """Return the kind and the name of each exported symbol of the library."""
     path = c_library.built() / "lib" / "libv3dg.so"
     command = ["nm", "-D", "--defined-only", str(path)]
     lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
@@ -44,7 +44,7 @@ def symbols():
 
 
 def layout():
-    """Return the lines of print_abi.c."""
+    """Return the lines that print_abi.c prints."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "print_abi"
         source = HERE / "print_abi.c"

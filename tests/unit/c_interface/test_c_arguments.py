@@ -27,7 +27,7 @@ def scene(tmp_path_factory):
 
 @contextlib.contextmanager
 def refused(expected):
-    """Expect a failure of an argument whose message begins with a text."""
+    """Expect an argument error with a message that begins with a text."""
     with pytest.raises(Failure, match=expected) as failure:
         yield
     assert failure.value.status == c_library.ARGUMENT

@@ -1,5 +1,5 @@
-"""Cuts of the C library are those of `v3dg.select`, and their gaussians those of
-`Selection.gaussians`."""
+"""Cuts of the C library equal those of `v3dg.select`, and their gaussians equal those
+of `Selection.gaussians`."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -19,8 +19,8 @@ NUM_TRIALS = 300
 
 @pytest.fixture(scope="module")
 def bundles(tmp_path_factory):
-    """Files of small bundles of both codecs and several degrees, and one of more
-    clusters."""
+    """Return paths of small bundles with both codecs and several SH degrees, and of one
+    with more clusters."""
     folder = tmp_path_factory.mktemp("bundles")
     rng = np.random.default_rng(5)
     made = [
@@ -39,7 +39,7 @@ def bundles(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def opened(bundles):
-    """The same bundles in Python and in one scene of the C library."""
+    """Yield the same bundles in Python and in one scene of the C library."""
     with CScene(bundles[0]) as scene:
         for path in bundles[1:]:
             scene.add_bundle(path)
@@ -101,7 +101,7 @@ def any_options(rng):
 
 
 def selected(scene, camera, options):
-    """Return the cut of Python, or None and the reason why there is none."""
+    """Return the cut of Python and "", or None and the error message."""
     try:
         return select(scene, camera, device="cpu", **options), ""
     except ValueError as error:
@@ -220,8 +220,8 @@ def test_pairs_say_where_their_gaussians_are(opened):
 
 
 def test_cuts_of_resident_pages_and_what_they_miss(opened):
-    """The cut and the priorities are those of the core; missing pages can be loaded in
-    their order, and with all of them the cut is that of all pages."""
+    """The cut and the priorities equal those of the core. Missing pages can be loaded
+    in the order of the list. Once all are loaded, the cut is that of all pages."""
     bundles, c_scene = opened
     num_missing = 0
     for seed in range(60):

@@ -1,5 +1,5 @@
-"""The C library is installed, found by CMake, and used by the examples and by the
-program that opens its page of the documentation."""
+"""The C library is installed and found by CMake. The examples use it, and so does the
+first program on its page of the documentation."""
 
 import os
 import re
@@ -28,7 +28,7 @@ def run(*command, **options):
 
 @pytest.fixture(scope="module")
 def prefix(tmp_path_factory):
-    """The folder into which the library is installed."""
+    """Return the folder into which the library is installed."""
     folder = tmp_path_factory.mktemp("prefix")
     build = c_library.built()
     with c_library.building():
@@ -38,7 +38,7 @@ def prefix(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def programs(prefix, tmp_path_factory):
-    """The examples, which are built with nothing but what is installed."""
+    """Return the folder of the examples, which are built from installed files only."""
     folder = tmp_path_factory.mktemp("programs")
     source = folder / "source"
     shutil.copytree(ROOT / "examples" / "c", source)
@@ -130,7 +130,7 @@ def test_the_page_opens_with_thirty_lines_that_select(prefix, bundle, tmp_path):
 
 
 def test_the_library_needs_no_python(prefix):
-    """Nor anything else that a C++ program with OpenMP does not have."""
+    """The library needs only libraries of any C++ program with OpenMP."""
     text = run("readelf", "-d", prefix / "lib" / "libv3dg.so")
     needed = set(re.findall(r"NEEDED.*\[(.*?)\.so", text))
     assert needed <= {

@@ -1,4 +1,5 @@
-"""The C library opens and refuses what Python does, for the same reasons."""
+"""The C library opens the same files as Python, and refuses others for the same
+reasons."""
 
 import json
 import random
@@ -24,8 +25,8 @@ ROOT = Path(__file__).parents[3]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.v3dg"))
 NUM_CHANGES = 300
-# What only the C library refuses: layouts of the paper; JSON whose strings have half of
-# a surrogate pair or whose numbers no double holds; `false` in place of 0 in a header.
+# Only the C library refuses layouts of the paper, JSON strings with half of a surrogate
+# pair, JSON numbers that overflow a double, and `false` in place of 0 in a header.
 ONLY_IN_C = re.compile(
     "published with the V3DG paper|surrogate|number overflow|data_offsets.*false"
 )
@@ -40,7 +41,7 @@ def python_error(read, path):
 
 
 def c_error(path):
-    """Return the message of the C library for a file; None if it is opened."""
+    """Return the error message of the C library for a file, or None if it is opened."""
     failure = None
     try:
         with CScene(path):
@@ -55,7 +56,7 @@ def c_error(path):
 
 
 def check_same(read, path):
-    """Compare what both say; up to the value, which they may show differently."""
+    """Compare the messages of both up to the value, whose text may differ."""
     expected = python_error(read, path)
     found = c_error(path)
     if found is not None and ONLY_IN_C.search(found):
@@ -67,7 +68,7 @@ def check_same(read, path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with the bundles to which scenes of the corpus refer."""
+    """Return a folder with the bundles to which scenes of the corpus refer."""
     (tmp_path / "sub").mkdir()
     for name, bundle in BUNDLES.items():
         bundle.write(tmp_path / "written.v3dg")

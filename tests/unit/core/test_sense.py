@@ -1,4 +1,4 @@
-"""The channels of a sensor and the mixing of meshes, against float64."""
+"""Compares the channels of a sensor and the mixing of meshes with float64."""
 
 import numpy as np
 import pytest
@@ -9,13 +9,13 @@ from devices import host
 from reference import sense as reference
 
 CHANNELS = ("depth", "median_depth", "normal", "instance", "weight")
-# Pixels in which rounding may decide otherwise than float64 are left out.
+# Pixels in which rounding may change a decision are not compared.
 BAND = 1e-4
 STOPS = (None, 0.0, 1e-3, 0.3)
 
 
 def with_flat_gaussians(seed, camera, num):
-    """Gaussians whose shortest axis is clear."""
+    """Return gaussians of which one axis is clearly the shortest."""
     asset = scenes.random_gaussians(seed, camera, num, size_px=(1.0, 9.0), aspect=1.0)
     rng = np.random.default_rng(seed)
     scales = asset.scales * rng.permuted(
@@ -25,7 +25,7 @@ def with_flat_gaussians(seed, camera, num):
 
 
 def mesh_in(camera, seed, *, with_normals=True):
-    """A slanted mesh with holes and with edges of every coverage."""
+    """Return a slanted mesh with holes, and with edges of every coverage."""
     rng = np.random.default_rng(seed)
     shape = (camera.height, camera.width)
     y, x = np.mgrid[: shape[0], : shape[1]]
@@ -119,7 +119,7 @@ def test_meshes_are_mixed_as_in_the_reference(light, stop):
 
 
 def three_layers(opacities=(0.5, 0.5, 0.5), depths=(1.0, 2.0, 3.0)):
-    """Wide gaussians on the axis of a camera of one pixel, and the camera."""
+    """Return wide gaussians on the axis of a camera with one pixel, and the camera."""
     means = [[0, 0, depth] for depth in depths]
     camera = scenes.camera(1, 1, fx=1.0)
     return scenes.gaussians(means, scales=100.0, opacities=np.array(opacities)), camera
@@ -147,7 +147,7 @@ def test_a_gaussian_is_in_front_if_its_depth_is_smaller(depth, passed):
 
 
 def test_of_equal_weights_the_first_wins():
-    """The mesh takes all that a gaussian of opacity 1/2 leaves, which is as much."""
+    """The mesh has the weight that a gaussian of opacity 1/2 leaves, which is 1/2."""
     asset, camera = three_layers()
     layer = one_pixel(1.5, instance=np.int32(7), label=np.int32(3))
     channels = ("instance", "label", "weight")
@@ -218,7 +218,7 @@ def test_clipped_pixels_are_those_of_the_reference(seed):
 
 
 def test_small_tiles_and_windows_have_every_pixel():
-    """Sizes that are no multiple of a tile or a block."""
+    """Test sizes that are not multiples of a tile or a block."""
     for width, height in ((1, 1), (33, 31), (70, 3)):
         camera = scenes.camera(width, height, fx=30.0)
         asset = with_flat_gaussians(1, camera, 40)

@@ -1,5 +1,5 @@
-"""Channels of scenes: ids, labels and weights as `v3dg.pick` names them, batches,
-pools, stereo cameras, meshes, and what is refused."""
+"""Tests channels of scenes: ids, labels and weights against `v3dg.pick`, batches,
+pools, stereo cameras, meshes, and wrong arguments."""
 
 import dataclasses
 
@@ -45,7 +45,7 @@ def assert_same(image, other, planes=PLANES):
 
 @pytest.mark.parametrize("options", [{}, {"tolerance": 8.0, "fade": 1.5}, {"tolerance": 0.0}])
 def test_ids_and_weights_are_those_of_the_picked_gaussian(scene, options):
-    """`pick` blends one pixel by scalar code, without stopping early."""
+    """`pick` is an independent implementation: scalar code that never stops early."""
     camera = camera_at()
     image = v3dg.render(
         scene,
@@ -64,7 +64,7 @@ def test_ids_and_weights_are_those_of_the_picked_gaussian(scene, options):
             assert image.weight[y, x] == 0
             continue
         if hit.instance != image.instance[y, x]:
-            continue  # two weights that differ by rounding, or a fade
+            continue  # the two largest weights are nearly equal, or a fade is drawn
         num_compared += 1
         assert image.label[y, x] == scene.labels[hit.instance]
         if "tolerance" not in options or options["tolerance"] != 8.0:
@@ -153,8 +153,8 @@ def test_both_eyes_of_a_stereo_camera_have_channels(scene):
 
 
 def draw_window(scene, cut, window, mesh):
-    """The channels of the pixels [x0, x1) x [y0, y1), as a renderer draws them that may
-    be stopped."""
+    """Return the channels of the pixels [x0, x1) x [y0, y1), drawn by a renderer that
+    may be stopped."""
     x0, y0, x1, y1 = window
     part = np.s_[y0:y1, x0:x1]
     layer = MeshLayer(mesh.color[part], mesh.depth[part], mesh.coverage[part])
@@ -180,8 +180,8 @@ def draw_window(scene, cut, window, mesh):
 
 
 def test_parts_of_a_picture_have_its_bits():
-    """The whole picture has so many gaussians that it is drawn in bands; its halves are
-    drawn at once."""
+    """The whole picture has so many gaussians that it is drawn in bands, whereas each
+    of its halves is drawn at once."""
     rng = np.random.default_rng(1)
     bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 400, size=0.2), 64)
     scene = Scene()
@@ -219,7 +219,7 @@ def test_labels_follow_instances(tmp_path):
 
 
 def test_a_window_of_a_mesh_hides_what_is_behind(scene):
-    """A mesh before everything is all that the picture shows."""
+    """A mesh in front of all gaussians hides them."""
     shape = (HEIGHT, WIDTH)
     color = np.random.default_rng(0).uniform(0, 1, (*shape, 3)).astype(np.float32)
     layer = MeshLayer(color, np.full(shape, 0.02), normal=np.full((*shape, 3), 2.0))
