@@ -8,7 +8,7 @@
 
 namespace v3dg {
 
-// Returns random bits that depend only on the sum of seed and stream, and on the counter.
+// Returns random bits that depend only on seed + stream, and on the counter.
 V3DG_HD inline uint64_t random_bits(uint64_t seed, uint64_t stream, uint64_t counter) {
     // Three rounds of splitmix64; the counter is added in the second round.
     uint64_t x = seed;

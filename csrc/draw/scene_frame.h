@@ -31,8 +31,8 @@ struct HostScene {
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
     Span<const ClusterRuns> runs = {};
-    // For sensors that output ids: the label of each instance of the whole scene, if any
-    // has one; and the ids of `instances`, if these are only a part of the scene.
+    // For sensors that output ids: the label of each instance of the whole scene, if
+    // any has one; and the ids of `instances` if these are only a part of it.
     Span<const int32_t> labels = {};
     Span<const int32_t> instance_ids = {};
 };

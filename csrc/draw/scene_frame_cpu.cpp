@@ -250,7 +250,8 @@ void select_for(const HostScene& scene, const FrameRequest& request, const Selec
 // Sets the channel `clipped` of a picture of these pairs.
 void clip_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
                 const Window& window, uint8_t* clipped, const std::atomic<bool>* stop) {
-    mark_clipped(CutDraws(scene, camera, given).draws(), camera.pinhole(), window, clipped, stop);
+    const PixelSlopes slopes(camera.pinhole());
+    mark_clipped(CutDraws(scene, camera, given).draws(), slopes, window, clipped, stop);
 }
 
 // Sets the channel `clipped` of a picture whose cut has this tolerance. A cut leaves
@@ -434,7 +435,8 @@ SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t coun
     counts.render = render<float>(draws, camera.intrinsics<float>(), picture, false, *workspace,
                                   stop, sensor.is_on() ? &drawn : nullptr);
     if (sensor.planes.clipped != nullptr)
-        mark_clipped(draws, camera.pinhole(), picture.window, sensor.planes.clipped, stop);
+        mark_clipped(draws, PixelSlopes(camera.pinhole()), picture.window, sensor.planes.clipped,
+                     stop);
     counts.gaussians = static_cast<int64_t>(count);
     counts.draw_seconds = now() - start;
     return counts;

@@ -5,6 +5,7 @@
 #include <atomic>
 #include <vector>
 
+#include "camera/pixel_slopes.h"
 #include "draw/render.h"
 
 namespace v3dg {
@@ -20,10 +21,9 @@ void sense_band(const std::vector<Draw<float>>& draws, const Picture<float>& pic
                 const std::atomic<bool>* stop);
 
 // Marks the pixels of a window whose rays, from the near plane on, meet the body of a
-// gaussian that is not drawn because its mean is before that plane: 1, else 0. The
-// camera is a pinhole. `draws` has all gaussians that may be near, not only those in
-// the frustum.
-void mark_clipped(const std::vector<Draw<float>>& draws, const Pinhole<double>& camera,
+// gaussian that is not drawn because its mean is before that plane: 1, else 0. `draws`
+// has all gaussians that may be near, not only those in the frustum.
+void mark_clipped(const std::vector<Draw<float>>& draws, const PixelSlopes& slopes,
                   const Window& window, uint8_t* clipped, const std::atomic<bool>* stop);
 
 }  // namespace v3dg

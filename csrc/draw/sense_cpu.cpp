@@ -161,19 +161,19 @@ void sense_band(const std::vector<Draw<float>>& draws, const Picture<float>& pic
     });
 }
 
-void mark_clipped(const std::vector<Draw<float>>& draws, const Pinhole<double>& camera,
+void mark_clipped(const std::vector<Draw<float>>& draws, const PixelSlopes& slopes,
                   const Window& window, uint8_t* clipped, const std::atomic<bool>* stop) {
-    const std::vector<ClippedBody> bodies = bodies_of(draws, camera.near_depth, stop);
+    const double near_depth = slopes.near_depth();
+    const std::vector<ClippedBody> bodies = bodies_of(draws, near_depth, stop);
     const auto width = static_cast<size_t>(window.width());
     parallel_for(static_cast<size_t>(window.height()), 1, [&](size_t row) {
         if (is_stopped(stop)) return;
-        const double y = (window.y0 + static_cast<double>(row) + 0.5 - camera.cy) / camera.fy;
+        const double y = slopes.y_of(window.y0 + static_cast<double>(row));
         for (size_t column = 0; column < width; ++column) {
-            const double x =
-                (window.x0 + static_cast<double>(column) + 0.5 - camera.cx) / camera.fx;
+            const double x = slopes.x_of(window.x0 + static_cast<double>(column));
             clipped[row * width + column] = std::any_of(
                 bodies.begin(), bodies.end(),
-                [&](const ClippedBody& body) { return meets_body(body, x, y, camera.near_depth); });
+                [&](const ClippedBody& body) { return meets_body(body, x, y, near_depth); });
         }
     });
 }

@@ -185,6 +185,10 @@ CALLS = {
         lambda **given: v3dg.Scene.of(BUNDLE).set_environment(**given),
         {"environment": 2, "ids": [0]},
     ),
+    "Scene.set_label": (
+        lambda **given: v3dg.Scene.of(BUNDLE).set_label(**given),
+        {"label": 2, "ids": [0]},
+    ),
     "Renderer.settle": (
         lambda **given: v3dg.Renderer(BUNDLE, device="cpu", memory="64MB").settle(CAMERA, **given),
         options(fade=1.05, timeout=30.0),

@@ -13,9 +13,15 @@ ROOT = Path(__file__).parents[3]
 CSRC = ROOT / "csrc"
 PROGRAM = ROOT / "tests" / "cpp" / "second_camera.cpp"
 # Folders that draw pictures with pinhole cameras that they choose themselves; the
-# bindings, which create the cameras of users; and projection, which has separate
-# kernels for pinholes.
-USERS_OF_PINHOLES = {"camera", "fit_group", "levels", "bindings", "project"}
+# bindings and the C library, which create the cameras of users; and projection, which
+# has separate kernels for pinholes.
+USERS_OF_PINHOLES = {"camera", "fit_group", "levels", "bindings", "c_interface", "project"}
+# Sources that translate the fields of users' cameras.
+MAKERS_OF_CAMERAS = {
+    "bindings/bind_types.cpp",
+    "c_interface/cameras.cpp",
+    "c_interface/scene_file.cpp",
+}
 
 
 def compiler() -> str | None:
@@ -75,4 +81,4 @@ def test_fields_of_a_pinhole_are_known_to_its_folder_alone() -> None:
         for path in sources
         if path.parent.name != "camera" and field.search(path.read_text(encoding="utf-8"))
     }
-    assert users == {"bindings/bind_types.cpp"}
+    assert users == MAKERS_OF_CAMERAS

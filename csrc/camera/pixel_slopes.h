@@ -1,0 +1,21 @@
+#pragma once
+
+// The slopes x / z and y / z of the rays through the pixel centres of a pinhole.
+
+#include "camera/pinhole.h"
+
+namespace v3dg {
+
+class PixelSlopes {
+  public:
+    explicit PixelSlopes(const Pinhole<double>& camera) : camera_(camera) {}
+
+    double x_of(double column) const { return (column + 0.5 - camera_.cx) / camera_.fx; }
+    double y_of(double row) const { return (row + 0.5 - camera_.cy) / camera_.fy; }
+    double near_depth() const { return camera_.near_depth; }
+
+  private:
+    Pinhole<double> camera_;
+};
+
+}  // namespace v3dg
