@@ -139,8 +139,8 @@ struct BoundRequest {
     }
 };
 
-// Throws ValueError if the device cannot draw channels and meshes of scenes, or the
-// channel `clipped`, but is asked to.
+// Throws ValueError if channels and meshes of a scene, or the channel `clipped`, are
+// requested on a device that cannot draw them.
 void check_sensor(Device device, const SensorRequest& sensor) {
     if (sensor.is_on() && backend_of(device).traits.draws_only_plainly)
         throw py::value_error(

@@ -18,8 +18,8 @@ bool& channel_of(Channels& channels, const std::string& name) {
     throw py::value_error("channels: expected names of channels, got '" + name + "'");
 }
 
-// Borrows a plane of a mesh with `channels` numbers a pixel, 0 for a plane without an
-// axis of channels. Null for None.
+// Borrows a plane of a mesh with `channels` numbers a pixel. `channels` is 0 for a
+// plane without an axis of channels. Returns null for None.
 template <class T>
 const T* plane_of(Device device, const py::object& array, const char* name,
                   const std::vector<py::ssize_t>& shape, py::ssize_t channels) {

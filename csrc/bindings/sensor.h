@@ -11,7 +11,7 @@
 
 namespace v3dg {
 
-// New planes for channels. A channel that is not asked for is None.
+// New planes for channels. A channel that is not requested is None.
 struct NewChannels {
     py::object median_depth = py::none(), normal = py::none(), instance = py::none(),
                label = py::none(), weight = py::none(), clipped = py::none();
@@ -49,7 +49,7 @@ class BoundSensor {
 
     const Channels& channels() const { return channels_; }
     // Returns the request for planes of this shape on this device. Throws ValueError if
-    // the mesh has another shape or is elsewhere.
+    // the mesh has another shape or is on another device.
     SensorRequest request(Device device, const std::vector<py::ssize_t>& shape) const;
 
   private:

@@ -45,7 +45,7 @@ def test_what_differs_between_systems_compiles(target, tmp_path):
 
 @pytest.fixture(scope="module")
 def printed():
-    """A function that returns the lines of the program for a number of threads."""
+    """Return a function that runs the program and returns its lines."""
     if not BUILDS:
         pytest.skip("needs a build by a preset: cmake --preset cpu")
     build = ["cmake", "--build", BUILDS[0], "--target", "portable_core"]

@@ -42,14 +42,14 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def module(tmp_path_factory):
-    """The compiled module."""
+    """Return the path of the compiled module."""
     path = tmp_path_factory.mktemp("wasm") / "v3dg.wasm"
     subprocess.run([sys.executable, WASM / "build.py", path], check=True)
     return path
 
 
 class Arrays:
-    """The file of arrays that node reads."""
+    """The file with the arrays for Node.js."""
 
     def __init__(self):
         self._parts = []
@@ -160,7 +160,7 @@ def view_of(camera, rule):
 
 
 def expected_bytes(scene, camera, rule):
-    """Return what node writes for the cut of a view."""
+    """Return the bytes that Node.js should write for the cut of a view."""
     try:
         cut = v3dg.select(scene, camera, device="cpu", **rule)
     except ValueError as error:
@@ -178,7 +178,7 @@ def expected_bytes(scene, camera, rule):
 
 
 def trial_scenes(rng, bundles, arrays):
-    """Yield scenes for node, each with the bytes that are expected of its views."""
+    """Yield scenes for Node.js, each with the expected bytes for its views."""
     for _ in range(-(-NUM_VIEWS // VIEWS_OF_A_SCENE)):
         scene, used = random_scene(rng, bundles)
         factors = scene.factors

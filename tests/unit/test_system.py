@@ -1,5 +1,5 @@
-"""What Windows lacks is removed from this Python, and everything that needs no POSIX
-still works; so do the other branches of `_files` and `_system` alone."""
+"""The package works without the functions that Windows lacks, which are removed from
+this Python. `_files` and `_system` are also tested alone."""
 
 import subprocess
 import sys
@@ -142,7 +142,7 @@ def test_ctrl_c_is_raised_again_without_timers(tmp_path):
 
 @pytest.fixture
 def no_offsets(monkeypatch):
-    """Without reads and writes at offsets."""
+    """Remove reads and writes at offsets."""
     monkeypatch.delattr("os.preadv")
     monkeypatch.delattr("os.pwrite")
 

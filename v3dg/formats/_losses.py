@@ -123,7 +123,7 @@ def _largest_error(
 
 
 def _largest_angle(quats: npt.NDArray[np.floating], read: npt.NDArray[np.floating]) -> float:
-    """Return the largest angle in degrees by which reading turns an ellipsoid.
+    """Return the largest angle in degrees by which reading rotates an ellipsoid.
     Half turns about its own axes do not turn it."""
     largest = 0.0
     for rows in blocks(len(quats)):
