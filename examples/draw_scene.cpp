@@ -99,8 +99,8 @@ int main(int num_arguments, char** arguments) {
                                  .depth = nullptr};
     SelectRule rule{};
     rule.tolerance_px2 = 3.0f;
-    const SceneFrameCounts counts =
-        cpu::draw_scene(scene, {.eyes = camera, .rule = rule, .shade = {}}, rule, {&picture, 1});
+    const SceneFrameCounts counts = cpu::draw_scene(
+        scene, {.eyes = camera, .rule = rule, .shade = {}}, rule, {&picture, 1}, {});
     std::printf("%lld gaussians selected, %llu in the frustum\n",
                 static_cast<long long>(counts.gaussians),
                 static_cast<unsigned long long>(counts.render.in_frustum));
