@@ -7,11 +7,13 @@
 #include <algorithm>
 #include <cerrno>
 #include <cmath>
+#include <cstdint>
 #include <cstdio>
 #include <cstring>
 #include <filesystem>
 #include <map>
 #include <set>
+#include <string>
 #include <system_error>
 #include <utility>
 
@@ -119,6 +121,15 @@ float positive_float(const Node& node) {
     return rounded;
 }
 
+// Returns a whole number in a range, or throws.
+int32_t whole_number(const Node& node, int32_t low, int32_t high) {
+    const double number = node.number();
+    if (number != std::trunc(number) || number < low || number > high)
+        throw node.error("a whole number from " + std::to_string(low) + " to " +
+                         std::to_string(high));
+    return static_cast<int32_t>(number);
+}
+
 void read_factors(const Fields& fields, v3dg_instance& out) {
     const auto field = [&](const char* name) {
         const auto found = fields.find(name);
@@ -138,13 +149,10 @@ void read_factors(const Fields& fields, v3dg_instance& out) {
                 throw tint->error("3 numbers of at least 0 that a float32 can hold");
         }
     }
-    if (const Node* environment = field("environment")) {
-        const double number = environment->number();
-        const bool is_inside = number >= kSharedEnvironment && number <= kMostEnvironment;
-        if (number != std::trunc(number) || !is_inside)
-            throw environment->error("a whole number from -1 to 16777215");
-        out.environment = static_cast<int32_t>(number);
-    }
+    if (const Node* environment = field("environment"))
+        out.environment = whole_number(*environment, kSharedEnvironment, kMostEnvironment);
+    // Labels are only checked: cuts have no use for them.
+    if (const Node* label = field("label")) whole_number(*label, -1, INT32_MAX);
 }
 
 int32_t lens_of(const Fields& fields) {
@@ -344,7 +352,7 @@ class SceneFiles {
     static void add(const Node& node, const Subjects& subjects, SceneBuilder& scene) {
         const Fields fields =
             node.only_fields({}, {"bundle", "scene", "position", "quaternion", "scale", "matrix",
-                                  "up", "importance", "opacity", "tint", "environment"});
+                                  "up", "importance", "opacity", "tint", "environment", "label"});
         if (fields.count("bundle") == fields.count("scene"))
             throw node.error("exactly one of the fields bundle and scene");
         if (!fields.count("matrix")) node.field("position");

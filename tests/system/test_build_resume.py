@@ -391,7 +391,7 @@ def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
         locked.append(name)
 
     locked = []
-    monkeypatch.setattr("v3dg.levels.unfinished.lock", lock)
+    monkeypatch.setattr("v3dg._files.lock", lock)
     with _open_locked(path) as file:
         assert os.path.samestat(os.fstat(file.fileno()), path.stat())
     assert len(locked) == 2
@@ -511,7 +511,9 @@ def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, 
         write(descriptor, data, offset)
 
     def full(descriptor, data, offset):
-        if kind_of(descriptor, offset) != kind:
+        # The head of the file is written again over its own bytes, which needs no room.
+        is_head_again = left[0] < 0 and offset == 0
+        if is_head_again or kind_of(descriptor, offset) != kind:
             return write(descriptor, data, offset)
         left[0] -= 1
         if left[0] >= 0:

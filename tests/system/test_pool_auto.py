@@ -171,8 +171,8 @@ def test_what_needs_all_is_drawn_of_all(path, device, free):
 def test_what_is_free_on_the_host_follows_the_container(monkeypatch):
     from v3dg.levels import memory
 
+    monkeypatch.setattr(memory._system, "available_memory", lambda: 4096 << 10)
     texts = {
-        "/proc/meminfo": "MemAvailable: 4096 kB\n",
         "/sys/fs/cgroup/memory.max": "3000000\n",
         "/sys/fs/cgroup/memory.current": "1000000\n",
     }

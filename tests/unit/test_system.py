@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import v3dg
 from v3dg import _files, _system, _windows
 from v3dg.export._below import Folder
 
@@ -46,7 +47,7 @@ os.sep  # paths stay those of this system
 
 def run(code, folder, *arguments):
     """Run code in a process without the functions that Windows lacks."""
-    root = Path(__file__).parents[2]
+    root = Path(v3dg.__file__).parents[1]
     program = f"{WINDOWS}\nsys.path.insert(0, {str(root)!r})\n{textwrap.dedent(code)}"
     return subprocess.run(
         [sys.executable, "-c", program, *arguments],
