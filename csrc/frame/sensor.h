@@ -13,6 +13,12 @@ namespace v3dg {
 // Values of the channels of ids. Instances and labels are numbered from 0.
 constexpr int32_t kNoInstance = -1, kMeshInstance = -2, kNoLabel = -1;
 
+// Returns a plane of `width` numbers per pixel from pixel `pixel` on; null stays null.
+template <class T>
+V3DG_HD T* plane_from(T* plane, size_t width, size_t pixel) {
+    return plane == nullptr ? nullptr : plane + width * pixel;
+}
+
 // The channels of a picture, row major. Null planes are not computed.
 struct SensorPlanes {
     // Depth of the gaussian behind which half of the light is gone; 0 if less is gone.
@@ -33,15 +39,12 @@ struct SensorPlanes {
     }
     // Returns the planes from pixel `pixel` on.
     V3DG_HD SensorPlanes from(size_t pixel) const {
-        const auto moved = [pixel](auto* plane, size_t width) {
-            return plane == nullptr ? nullptr : plane + width * pixel;
-        };
-        return {.median_depth = moved(median_depth, 1),
-                .normal = moved(normal, 3),
-                .instance = moved(instance, 1),
-                .label = moved(label, 1),
-                .weight = moved(weight, 1),
-                .clipped = moved(clipped, 1)};
+        return {.median_depth = plane_from(median_depth, 1, pixel),
+                .normal = plane_from(normal, 3, pixel),
+                .instance = plane_from(instance, 1, pixel),
+                .label = plane_from(label, 1, pixel),
+                .weight = plane_from(weight, 1, pixel),
+                .clipped = plane_from(clipped, 1, pixel)};
     }
 };
 
@@ -61,15 +64,12 @@ struct MeshLayer {
     V3DG_HD bool is_there() const { return depth != nullptr; }
     // Returns the layer from pixel `pixel` on.
     V3DG_HD MeshLayer from(size_t pixel) const {
-        const auto moved = [pixel](auto* plane, size_t width) {
-            return plane == nullptr ? nullptr : plane + width * pixel;
-        };
-        return {.color = moved(color, 3),
-                .depth = moved(depth, 1),
-                .coverage = moved(coverage, 1),
-                .normal = moved(normal, 3),
-                .instance = moved(instance, 1),
-                .label = moved(label, 1),
+        return {.color = plane_from(color, 3, pixel),
+                .depth = plane_from(depth, 1, pixel),
+                .coverage = plane_from(coverage, 1, pixel),
+                .normal = plane_from(normal, 3, pixel),
+                .instance = plane_from(instance, 1, pixel),
+                .label = plane_from(label, 1, pixel),
                 .light = light};
     }
 };
