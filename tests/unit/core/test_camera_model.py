@@ -28,6 +28,17 @@ def compiler() -> str | None:
     return shutil.which(os.environ.get("CXX", "c++"))
 
 
+def assert_program_finds_nothing(name: str, folder: Path) -> None:
+    """Compile a program of tests/cpp; assert that it succeeds and prints nothing."""
+    program = folder / name
+    source = ROOT / "tests" / "cpp" / f"{name}.cpp"
+    command = [compiler(), "-std=c++20", "-O1", "-I", CSRC, source, "-o", program]
+    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert compiled.returncode == 0, compiled.stderr
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
 @pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
 def test_second_camera_model_goes_through_projection(tmp_path: Path) -> None:
     """The model satisfies the concept, and its ellipses and gradients agree with its
@@ -44,24 +55,12 @@ def test_second_camera_model_goes_through_projection(tmp_path: Path) -> None:
 def test_distorted_models_agree_with_finite_differences_and_cull_nothing_drawn(
     tmp_path: Path,
 ) -> None:
-    program = tmp_path / "distorted_cameras"
-    source = ROOT / "tests" / "cpp" / "distorted_cameras.cpp"
-    command = [compiler(), "-std=c++20", "-O1", "-I", CSRC, source, "-o", program]
-    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert compiled.returncode == 0, compiled.stderr
-    done = subprocess.run([program], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, "")
+    assert_program_finds_nothing("distorted_cameras", tmp_path)
 
 
 @pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
 def test_boxes_of_directions_hold_every_point_of_a_gaussian(tmp_path: Path) -> None:
-    program = tmp_path / "ray_boxes"
-    source = ROOT / "tests" / "cpp" / "ray_boxes.cpp"
-    command = [compiler(), "-std=c++20", "-O1", "-I", CSRC, source, "-o", program]
-    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert compiled.returncode == 0, compiled.stderr
-    done = subprocess.run([program], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, "")
+    assert_program_finds_nothing("ray_boxes", tmp_path)
 
 
 def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
