@@ -1,6 +1,11 @@
 """Refinements in units: what they leave unchanged, that they depend neither on workers
 nor on interruptions, and how units are made."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +17,7 @@ from rooms import room
 from v3dg import BuildConfig, _core
 from v3dg._device import CPU
 from v3dg.bundle.parts import divided
+from v3dg.cli import refine as command
 from v3dg.levels import build_file, discard_levels, levels_path
 from v3dg.levels.refined import RefineRequest, with_refined_levels
 from v3dg.levels.refined_units import refined_bundle
@@ -331,3 +337,65 @@ def test_cameras_of_a_unit_see_some_of_it(draft):
     assert cameras_that_see(draft, [camera, outwards]) == (camera,)
     assert cameras_that_see(draft, [outwards]) == (outwards,)
     assert cameras_that_see(draft, []) == ()
+
+
+SCRIPT = f"""
+import sys
+from v3dg import BuildConfig
+from v3dg.levels import build_file, quality, refine_sizes, refined
+refine_sizes.UNIT_LEAVES = {UNIT_LEAVES}
+refined._NUM_WEIGHING_PICTURES = 20
+quality._LEAST_PICTURES = {REQUEST.steps}
+quality._GAUSSIANS_PER_PICTURE = 1 << 40
+build_file(
+    sys.argv[1], sys.argv[2], config=BuildConfig(cluster_size=32, steps=0), seed=3,
+    progress=False, device="cpu", quality="standard", resume=True,
+)
+"""
+
+
+def test_a_refinement_that_is_killed_again_and_again_gets_to_its_end(file, tmp_path):
+    """The bytes are those of a refinement in one go."""
+    output = tmp_path / "out" / "out.v3dg"
+    output.parent.mkdir()
+    folder = units_folder(levels_path(output))
+    arguments = [sys.executable, "-c", SCRIPT, file, output]
+    environment = os.environ | {"PYTHONPATH": ":".join(map(str, sys.path))}
+    num_kills = 0
+    finished = set()
+    while not output.exists():
+        process = subprocess.Popen(arguments, env=environment)
+        while process.poll() is None:
+            names = {path.name for path in folder.glob("*.v3dg")}
+            if len(names) > num_kills:
+                process.send_signal(signal.SIGKILL)
+                assert finished < names
+                finished = names
+                num_kills += 1
+                break
+            time.sleep(0.001)
+        process.wait()
+    assert num_kills >= 2
+    build(file, tmp_path / "one.v3dg")
+    assert output.read_bytes() == (tmp_path / "one.v3dg").read_bytes()
+    assert names_in(output.parent) == ["out.v3dg"]
+
+
+def test_the_command_refines_in_units(draft, tmp_path, capsys):
+    draft.write(tmp_path / "draft.v3dg")
+    output = tmp_path / "refined.v3dg"
+    command.run(
+        command.Refine(
+            bundle=tmp_path / "draft.v3dg",
+            output=output,
+            steps=REQUEST.steps,
+            seed=REQUEST.seed,
+            device="cpu",
+            quiet=True,
+        )
+    )
+    line = capsys.readouterr().out.strip()
+    assert f"6 steps for each of {NUM_UNITS} units and the levels above them" in line
+    expected = refined_bundle(draft, REQUEST, [CPU], progress=False)
+    assert output.read_bytes() == bytes_of(expected, tmp_path)
+    assert names_in(tmp_path) == ["bytes.v3dg", "draft.v3dg", "refined.v3dg"]
