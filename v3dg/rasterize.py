@@ -91,7 +91,8 @@ def rasterize(
     arrays.append(torch.as_tensor(background, dtype=means.dtype))
     settings = DrawSettings(filter_px2=filter_px2, antialiased=antialiased)
     views = Views(cameras=(camera.core,), num_cameras=1)
-    return Image(*draw_views(views, settings, [[array] for array in arrays]))
+    planes = draw_views(views, settings, [[array] for array in arrays])
+    return Image(*(plane.squeeze(0) for plane in planes))
 
 
 def check_device(means: Array) -> None:
@@ -130,8 +131,8 @@ class Views:
     views.
 
     Attributes:
-        cameras: The cameras of each set: one camera of any model, or C pinholes whose
-            arrays are on the CPU.
+        cameras: The cameras of each set: one camera of any model, which is quicker than
+            a batch of one; or C pinholes whose arrays are on the CPU.
         num_cameras: C.
         viewmats: (V, 4, 4) tensor of the poses, if they have gradients. The cameras
             must then be `_core.Cameras`.
@@ -194,9 +195,7 @@ def draw_views(
     probe: CenterProbe | None = None,
 ) -> tuple[torch.Tensor, ...]:
     """Draw tensors differentiably. Return colour, alpha and depth (or None) of the
-    first set, then those of the next set, and so on.
-
-    The planes are (C, H, W, ...), or (H, W, ...) if the cameras are `_core.Camera`.
+    first set, (C, H, W, ...), then those of the next set, and so on.
 
     Args:
         inputs: For each of means, quats, scales, opacities, sh and backgrounds: one
@@ -212,21 +211,35 @@ def draw_views(
     keep_tape = torch.is_grad_enabled() and any(
         tensor is not None and tensor.requires_grad for tensor in (views.viewmats, *tensors)
     )
-    counts = [len(group) for group in inputs]
-    # The poses are passed without their gradient, because it would be kept twice.
-    unposed = Views(views.cameras, views.num_cameras)
-    return tuple(_function()(unposed, settings, keep_tape, counts, probe, *optional, *tensors))
+    call = _Call(
+        views=Views(views.cameras, views.num_cameras),  # the poses are passed as tensors
+        settings=settings,
+        counts=[len(group) for group in inputs],
+        keep_tape=keep_tape,
+        probe=probe,
+    )
+    return tuple(_function()(call, *optional, *tensors))
 
 
-def _slots_of_set(views: Views, counts: list[int], number: int) -> list[Sequence[int]]:
-    """Return, for each kind of input, the indices (among all tensors) of the tensors
-    that a set uses."""
-    slots: list[Sequence[int]] = []
-    first = 0
-    for count in counts:
-        slots.append(views.inputs_of(range(first, first + count), number))
-        first += count
-    return slots
+@dataclass(frozen=True, eq=False)
+class _Call:
+    """The arguments of `draw_views` that are not tensors."""
+
+    views: Views
+    settings: DrawSettings
+    counts: list[int]  # number of tensors of each kind of input
+    keep_tape: bool
+    probe: CenterProbe | None
+
+    def slots_of_set(self, number: int) -> list[Sequence[int]]:
+        """Return, for each kind of input, the indices (among all tensors) of the
+        tensors that a set uses."""
+        slots: list[Sequence[int]] = []
+        first = 0
+        for count in self.counts:
+            slots.append(self.views.inputs_of(range(first, first + count), number))
+            first += count
+        return slots
 
 
 def _to_core(gradient: torch.Tensor | None) -> Array | None:
@@ -236,6 +249,13 @@ def _to_core(gradient: torch.Tensor | None) -> Array | None:
     if gradient.is_cuda:
         return gradient
     return gradient.numpy()
+
+
+def _alone(plane: Array | None) -> Array | None:
+    """Return the gradient (H, W, ...) of the only picture."""
+    if plane is None:
+        return None
+    return plane[0]
 
 
 def _draw_set(
@@ -279,13 +299,15 @@ def _draw_set(
 
 
 def _planes(drawn: _core.Rasterized | _core.RasterizedViews) -> list[torch.Tensor | None]:
-    """Return colour, alpha and depth as tensors."""
+    """Return colour, alpha and depth (C, H, W, ...) as tensors."""
     import torch
 
     planes: list[torch.Tensor | None] = []
     for plane in (drawn.color, drawn.alpha, drawn.depth):
         if plane is None:
             planes.append(None)
+        elif isinstance(drawn, _core.Rasterized):
+            planes.append(torch.as_tensor(plane).unsqueeze(0))
         else:
             planes.append(torch.as_tensor(plane))
     return planes
@@ -343,9 +365,7 @@ def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
 class _Context(Protocol):
     """The data that autograd stores between the forward and the backward pass."""
 
-    views: Views
-    counts: list[int]
-    probe: CenterProbe | None
+    call: _Call
     tapes: list[_core.Tape | _core.ViewsTape]
     devices: list[torch.device]
     pose: tuple[torch.device, torch.dtype]
@@ -356,22 +376,21 @@ class _Context(Protocol):
     def set_materialize_grads(self, value: bool, /) -> None: ...
 
 
-def _forward(
-    ctx: _Context, settings: DrawSettings, inputs: Sequence[torch.Tensor], *, keep_tape: bool
-) -> tuple[torch.Tensor | None, ...]:
+def _forward(ctx: _Context, inputs: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
     """Return the planes of the pictures of all sets, one set after another."""
+    call = ctx.call
     pictures: list[torch.Tensor | None] = []
-    for number, camera in enumerate(ctx.views.cameras):
-        slots = _slots_of_set(ctx.views, ctx.counts, number)
+    for number, camera in enumerate(call.views.cameras):
+        slots = call.slots_of_set(number)
         groups = [[inputs[slot] for slot in slots_of_kind] for slots_of_kind in slots]
-        planes, tape = _draw_set(camera, settings, groups, keep_tape=keep_tape)
+        planes, tape = _draw_set(camera, call.settings, groups, keep_tape=call.keep_tape)
         if tape is not None:
             ctx.tapes.append(tape)
         pictures += planes
     # On a GPU, the backward pass reads the inputs again, so autograd must detect if
     # they were overwritten.
     if inputs[0].is_cuda:
-        ctx.save_for_backward(*inputs[: -ctx.counts[-1]], *pictures)
+        ctx.save_for_backward(*inputs[: -call.counts[-1]], *pictures)
     return tuple(pictures)
 
 
@@ -383,8 +402,10 @@ def _gradients_of_set(
     tape = ctx.tapes[number]
     d_color, d_alpha, d_depth = map(_to_core, planes)
     if isinstance(tape, _core.Tape):
-        return _core.rasterize_backward(tape, d_color, d_alpha, d_depth, wants[0], wants[1])
-    slots = _slots_of_set(ctx.views, ctx.counts, number)
+        return _core.rasterize_backward(
+            tape, _alone(d_color), _alone(d_alpha), _alone(d_depth), wants[0], wants[1]
+        )
+    slots = ctx.call.slots_of_set(number)
     return _core.rasterize_views_backward(
         tape,
         d_color,
@@ -406,8 +427,8 @@ def _backward(
     import torch
 
     _ = ctx.saved_tensors  # raises an error if a saved tensor was overwritten
-    wants_centers, wants_poses, *wants_input = ctx.needs_input_grad[5:]
-    probe = ctx.probe
+    wants_centers, wants_poses, *wants_input = ctx.needs_input_grad[1:]
+    probe = ctx.call.probe
     wants = (wants_centers, probe is not None and probe.with_sizes, wants_poses)
     sums: list[torch.Tensor | None] = [None] * len(wants_input)
     center_gradients: list[list[torch.Tensor]] = []
@@ -417,7 +438,7 @@ def _backward(
         center_gradients.append(_center_parts(parts))
         if wants_poses:
             poses.append(torch.as_tensor(parts.poses))
-        slots = _slots_of_set(ctx.views, ctx.counts, number)
+        slots = ctx.call.slots_of_set(number)
         for slots_of_kind, part in zip(slots, _by_slot(parts, slots), strict=True):
             for slot, gradient in zip(slots_of_kind, part, strict=True):
                 if wants_input[slot]:
@@ -465,30 +486,24 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
         @staticmethod
         def forward(
             ctx: _Context,
-            views: Views,
-            settings: DrawSettings,
-            keep_tape: bool,
-            counts: list[int],
-            probe: CenterProbe | None,
+            call: _Call,
             centers: torch.Tensor | None,
             viewmats: torch.Tensor | None,
             *inputs: torch.Tensor,
         ) -> tuple[torch.Tensor | None, ...]:
             # The centres and the poses are only used in the backward pass.
             ctx.set_materialize_grads(False)
-            ctx.views = views
-            ctx.counts = counts
-            ctx.probe = probe
+            ctx.call = call
             ctx.tapes = []
             ctx.devices = [tensor.device for tensor in inputs]
             if viewmats is not None:
                 ctx.pose = (viewmats.device, viewmats.dtype)
-            return _forward(ctx, settings, inputs, keep_tape=keep_tape)
+            return _forward(ctx, inputs)
 
         @staticmethod
         def backward(
             ctx: _Context, *gradients: torch.Tensor | None
         ) -> tuple[torch.Tensor | None, ...]:
-            return None, None, None, None, None, *_backward(ctx, gradients)
+            return None, *_backward(ctx, gradients)
 
     return Rasterize.apply

@@ -17,7 +17,8 @@ from v3dg import _core
 from v3dg._device import CPU
 from v3dg._numbers import check, one_of, real, value_text, whole
 from v3dg.camera_batch import CameraBatch
-from v3dg.gaussians import Array, Gaussians
+from v3dg.cameras import Camera
+from v3dg.gaussians import Gaussians
 from v3dg.rasterize import (
     CenterGradient,
     CenterProbe,
@@ -284,12 +285,12 @@ def _views(
 ) -> Views:
     """Return the cameras of each set."""
     count = sizes.num_cameras
-    poses = viewmats.detach().cpu().reshape(-1, count, 4, 4)
-    intrinsics = Ks.detach().cpu().reshape(-1, count, 3, 3)
-    cameras = tuple(
-        CameraBatch(of_set.numpy(), K.numpy(), *size, near).core_on(CPU)
-        for of_set, K in zip(poses, intrinsics, strict=True)
-    )
+    poses = viewmats.detach().cpu().reshape(-1, count, 4, 4).numpy()
+    intrinsics = Ks.detach().cpu().reshape(-1, count, 3, 3).numpy()
+    pairs = zip(poses, intrinsics, strict=True)
+    if count == 1 and not viewmats.requires_grad:
+        return Views(tuple(Camera(pose[0], K[0], *size, near).core for pose, K in pairs), count)
+    cameras = tuple(CameraBatch(pose, K, *size, near).core_on(CPU) for pose, K in pairs)
     trained = None
     if viewmats.requires_grad:
         trained = viewmats.reshape(-1, 4, 4)
@@ -484,11 +485,10 @@ def _located(
     num_sets = sizes.num_sets
     columns: list[list[torch.Tensor]] = []
     for number, cameras in enumerate(views.cameras):
-        assert isinstance(cameras, _core.Cameras)
         means, quats, scales, opacities = shape[number::num_sets]
         unused_colors = means[:, None]
         rows = Gaussians(means, quats, scales, opacities, unused_colors).rows
-        columns.append([torch.as_tensor(part) for part in _ellipses(rows, cameras, look)])
+        columns.append(_ellipses(rows, cameras, look))
     arrays = []
     for column in zip(*columns, strict=True):
         whole = column[0]
@@ -509,14 +509,31 @@ def _located(
     return arrays, [*ids, is_seen]
 
 
-def _ellipses(rows: _core.Rows, cameras: _core.Cameras, look: _Look) -> tuple[Array, ...]:
-    """Return centres, depths, conics, opacities and radii of gaussians on the images of
-    cameras."""
-    return _core.ellipses_of_views(
+def _ellipses(
+    rows: _core.Rows, cameras: _core.Camera | _core.Cameras, look: _Look
+) -> list[torch.Tensor]:
+    """Return centres, depths, conics, opacities and radii (C, N, ...) of gaussians on
+    the images of cameras."""
+    import torch
+
+    antialiased = look.rasterize_mode == "antialiased"
+    if isinstance(cameras, _core.Cameras):
+        arrays = _core.ellipses_of_views(
+            rows,
+            cameras,
+            filter_px2=look.eps2d,
+            antialiased=antialiased,
+            far_depth=look.far_plane,
+            min_radius_px=look.radius_clip,
+        )
+        return [torch.as_tensor(array) for array in arrays]
+    e = _core.ellipses(
         rows,
         cameras,
         filter_px2=look.eps2d,
-        antialiased=look.rasterize_mode == "antialiased",
+        antialiased=antialiased,
         far_depth=look.far_plane,
         min_radius_px=look.radius_clip,
     )
+    of_camera = (e.centers, e.depths, e.conics, e.opacities, e.radii)
+    return [torch.as_tensor(array).unsqueeze(0) for array in of_camera]
