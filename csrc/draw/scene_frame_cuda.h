@@ -94,10 +94,10 @@ class SceneFrame {
                     cudaStream_t stream);
 
     // Enqueues a plain request (FrameRequest::is_plain). `pictures` are the pictures to
-    // draw, with channels and meshes of `sensors`; `place` sets their destinations. With `pages`,
-    // it first brings in pages that are ready, then draws the resident part of the pool's bundles.
-    // `rule` is the request's rule after the pacing of a budget; it is set to the rule that was
-    // used.
+    // draw, with the channels and meshes of `sensors`; `place` sets their destinations.
+    // With `pages`, it first brings in pages that are ready, then draws the resident
+    // part of the pool's bundles. `rule` is the request's rule after the pacing of a
+    // budget; it is set to the rule that was used.
     //
     // The scene, the pool and a given cut must exist until the drawing is finished. A
     // given cut is on the device and has one picture. If the frame is drawn again, it

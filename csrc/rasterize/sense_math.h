@@ -199,7 +199,8 @@ V3DG_HD V3DG_INLINE void write_pixel(const SensedPixel& pixel, size_t at, float 
 }
 
 // Sets the unit normal along an axis of a gaussian, in view space, pointing towards the
-// eye. `axis` is in model space, of any length. `p` is the gaussian's mean in view space.
+// eye. `axis` is in model space, of any length. `p` is the gaussian's mean in view
+// space.
 V3DG_HD V3DG_INLINE void normal_along(const float axis[3], const ModelView<float>& view,
                                       const float p[3], float normal[3]) {
     for (int i = 0; i < 3; ++i)

@@ -1,3 +1,6 @@
+// Implements scene_tables.h: uploads instances and poses, and finds bounds on what one
+// camera sees.
+
 #include "residency/scene_tables.h"
 
 #include <algorithm>

@@ -176,9 +176,8 @@ def _tensor(
     check(f"mesh.{name}", is_there, f"{text}, got {_kind_of(plane)}")
     tensor: torch.Tensor = plane
     check(f"mesh.{name}", tuple(tensor.shape) == shape, f"shape {shape}, got {tuple(tensor.shape)}")
-    is_real = tensor.dtype.is_floating_point
-    is_whole = not is_real and tensor.dtype not in (torch.bool, torch.complex64, torch.complex128)
-    fits = is_real or is_whole if dtype == "float32" else is_whole
+    is_whole = tensor.dtype in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+    fits = is_whole or (dtype == "float32" and tensor.dtype.is_floating_point)
     check(f"mesh.{name}", fits, f"numbers for {dtype}, got {tensor.dtype}")
     return tensor.detach().to(getattr(torch, dtype)).contiguous()
 
