@@ -522,7 +522,7 @@ class Mesh:
         color: (..., 3).
         depth, coverage: (...). On a CUDA device, `coverage` may be None: 1 where the
             depth is positive and finite.
-        normal: (..., 3) of length 1 or 0, or None.
+        normal: (..., 3) of any length, or None.
         instance, label: (...), or None.
         is_linear: Whether colours are in linear light.
     """

@@ -82,14 +82,16 @@ V3DG_HD V3DG_INLINE Strongest strongest_of(const SensedSums& front, const Sensed
     return out;
 }
 
-// Sets the blended normal of a pixel, of length 1, or 0 if there is none.
+// Sets the blended normal of a pixel, of length 1, or 0 if there is none. `mesh_normal`
+// has any length; null: unknown.
 V3DG_HD V3DG_INLINE void blended_normal(const SensedSums& front, const SensedSums& behind,
                                         const float* mesh_normal, const SensedShares& share,
                                         float normal[3]) {
-    for (int k = 0; k < 3; ++k) {
+    for (int k = 0; k < 3; ++k)
         normal[k] = share.front * front.normal[k] + share.behind * behind.normal[k];
-        if (mesh_normal != nullptr) normal[k] += share.mesh * mesh_normal[k];
-    }
+    const float mesh_length = mesh_normal == nullptr ? 0 : sqrt_of(dot3(mesh_normal, mesh_normal));
+    if (share.mesh > 0 && mesh_length > 0)
+        for (int k = 0; k < 3; ++k) normal[k] += share.mesh / mesh_length * mesh_normal[k];
     const float length = sqrt_of(dot3(normal, normal));
     for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] / length : 0.0f;
 }

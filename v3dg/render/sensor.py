@@ -125,15 +125,11 @@ class MeshLayer:
         one_of(self.light, "mesh.light", ("display", "linear"))
         shape = tuple(self.depth.shape)
         check("mesh.depth", len(shape) in (2, 3), f"shape (H, W) or (B, H, W), got {shape}")
-        normal = _tensor(self.normal, "normal", (*shape, 3), device, "float32")
-        if normal is not None:
-            length = normal.norm(dim=-1, keepdim=True)
-            normal = normal / length.where(length > 0, 1)
         return _Planes(
             color=_tensor(self.color, "color", (*shape, 3), device, "float32"),
             depth=_tensor(self.depth, "depth", shape, device, "float32"),
             coverage=_tensor(self.coverage, "coverage", shape, device, "float32"),
-            normal=normal,
+            normal=_tensor(self.normal, "normal", (*shape, 3), device, "float32"),
             instance=_tensor(self.instance, "instance", shape, device, "int32"),
             label=_tensor(self.label, "label", shape, device, "int32"),
         )
