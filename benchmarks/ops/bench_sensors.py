@@ -259,7 +259,8 @@ def cameras_in_room(count: int, size: int) -> list[v3dg.Camera]:
         target = np.array([*rng.uniform(-0.4, 0.4, 2), 0.8])
         if number % 2 == 1:
             target = eye + rng.normal(size=3) * [1, 1, 0.3]
-        cameras.append(v3dg.Camera.look_at(eye, target, fov_x=1.2, width=size, height=size))
+        view = v3dg.Camera.look_at(eye, target, fov_x=1.2, width=size, height=size, near=0.01)
+        cameras.append(view)
     return cameras
 
 

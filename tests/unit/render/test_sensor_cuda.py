@@ -64,7 +64,7 @@ def mesh_of(shape, seed=0, **planes):
     coverage = rng.choice([0.0, 0.4, 1.0], shape)
     normal = rng.normal(size=(*shape, 3))
     return MeshLayer(
-        rng.uniform(0, 1, (*shape, 3)), rng.uniform(3, 9, shape), coverage, normal, **planes
+        rng.uniform(0, 1, (*shape, 3)), rng.uniform(1, 9, shape), coverage, normal, **planes
     )
 
 
@@ -159,7 +159,7 @@ def test_instances_with_factors_have_the_channels_of_the_cpu(tinted_scene):
             for device in ("cuda", "cpu")
         ]
         assert_like_cpu(*drawn)
-        assert len(np.unique(drawn[1].instance)) > 10
+        assert len(np.unique(drawn[1].instance)) > 5
 
 
 @pytest.mark.parametrize("options", OPTIONS)
