@@ -588,8 +588,9 @@ class Mesh:
 
     Args:
         color: (..., 3).
-        depth, coverage: (...).
-        normal: (..., 3) of length 1 or 0, or None.
+        depth, coverage: (...). On a CUDA device, `coverage` may be None: 1 where the
+            depth is positive and finite.
+        normal: (..., 3) of any length, or None.
         instance, label: (...), or None.
         is_linear: Whether colours are in linear light.
     """
@@ -599,7 +600,7 @@ class Mesh:
         *,
         color: Array,
         depth: Array,
-        coverage: Array,
+        coverage: Array | None,
         normal: Array | None = None,
         instance: Array | None = None,
         label: Array | None = None,
@@ -809,11 +810,22 @@ class BatchPlanes:
     Args:
         color: (B, H, W, 3 or 4).
         alpha: (B, H, W), or None.
-        depth: (B, H, W), or None.
+        depth, median_depth, weight: (B, H, W), or None.
+        normal: (B, H, W, 3), or None.
+        instance, label: (B, H, W) int32, or None.
     """
 
     def __init__(
-        self, color: Array, alpha: Array | None = None, depth: Array | None = None
+        self,
+        color: Array,
+        alpha: Array | None = None,
+        depth: Array | None = None,
+        *,
+        median_depth: Array | None = None,
+        normal: Array | None = None,
+        instance: Array | None = None,
+        label: Array | None = None,
+        weight: Array | None = None,
     ) -> None: ...
 
 class BatchStats:

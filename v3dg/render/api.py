@@ -24,7 +24,7 @@ from v3dg.render.picture import Picture
 from v3dg.render.rays import check_rays, draw_sphere
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, mesh_device, sensor_of
+from v3dg.render.sensor import Channel, MeshLayer, sensor_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
@@ -129,12 +129,11 @@ def render(
         depth: Whether to draw the expected depth, too.
         channels: Names of channels that are drawn beside colour and alpha, and become
             attributes of the picture: "depth" (as `depth=True`), "median_depth",
-            "normal", "instance", "label", "weight", "clipped" (docs/sensors.md). On
-            CUDA devices, only "depth" is supported for scenes and bundles, and all but
-            "clipped" for assets. "clipped" needs a pinhole.
+            "normal", "instance", "label", "weight", "clipped" (docs/sensors.md).
+            "clipped" is drawn only on the CPU, and needs a pinhole.
         mesh: Picture of meshes of the same size, for one camera. Its pixels hide the
             gaussians behind them. Colour, alpha and channels include gaussians and
-            meshes. On CUDA devices, it is supported only for assets.
+            meshes.
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what
             the next picture of the same scene or bundle needs; a `Renderer` controls
@@ -155,8 +154,7 @@ def render(
     chosen_device = _device.resolve(device)
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
-    place = mesh_device(chosen_device, opened_subject)
-    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=place)
+    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=chosen_device)
     shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
