@@ -106,10 +106,10 @@ def render(
             The two eyes of a stereo camera share one cut and one frame. Their two
             pictures have common statistics, which are sums, except for the number of
             selected gaussians. None means the first camera of a scene's file, else the
-            camera of `first_camera`. An `EquirectangularCamera` is drawn on the CPU
-            with all gaussians resident, without statistics, and takes none
-            of `budget`, `cut`, `min_transmittance`, `mesh`, channels other than
-            "depth", and a number of bytes as `memory`.
+            camera of `first_camera`. An `EquirectangularCamera` is drawn with all
+            gaussians resident, without statistics, and takes none of `budget`, `cut`,
+            `min_transmittance`, `mesh`, channels other than "depth", and a number of
+            bytes as `memory`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -148,11 +148,13 @@ def render(
     """
     opened_subject, camera = _with_camera(subject, camera)
     cut_request = CutRequest(tolerance, budget, min_level, fade)
+    chosen_device = _device.resolve(device)
     if isinstance(camera, EquirectangularCamera):
         with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=_device.CPU)
-        check_rays(color_by, cut, sensor, min_transmittance, device, memory)
-        return draw_sphere(opened_subject, camera, cut_request, background, depth=with_depth)
-    chosen_device = _device.resolve(device)
+        check_rays(color_by, cut, sensor, min_transmittance, memory)
+        return draw_sphere(
+            opened_subject, camera, cut_request, background, chosen_device, depth=with_depth
+        )
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
     place = mesh_device(chosen_device, opened_subject)
