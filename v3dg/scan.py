@@ -196,9 +196,7 @@ def scan(
     if not chosen_device.is_cuda:
         size = 1  # so that the program can be interrupted between poses
     casts = [
-        cast_rays(
-            content, lidar.core, viewmats[first : first + size], cut, chosen_device, returns
-        )
+        cast_rays(content, lidar.core, viewmats[first : first + size], cut, chosen_device, returns)
         for first in range(0, max(1, len(poses)), size)
     ]
     batch = ScanBatch(lidar, poses, casts)

@@ -14,14 +14,14 @@ from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_cam
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
-from v3dg.image import Image, RenderedImage
+from v3dg.image import RenderedImage
 from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
-from v3dg.render.rays import check_rays, draw_sphere
+from v3dg.render.rays import RayImage, check_rays, draw_sphere
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
 from v3dg.render.sensor import Channel, MeshLayer, mesh_device, sensor_of
@@ -65,7 +65,7 @@ def render(
 @overload
 def render(
     subject: Subject | File, camera: EquirectangularCamera, **options: Unpack[_Options]
-) -> Image: ...
+) -> RayImage: ...
 @overload
 def render(
     subject: Subject | File, camera: Sequence[Camera], **options: Unpack[_Options]
@@ -87,7 +87,7 @@ def render(
     mesh: MeshLayer | None = None,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
-) -> Image | _Pictures:
+) -> RayImage | _Pictures:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.

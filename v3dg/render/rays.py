@@ -28,6 +28,18 @@ if TYPE_CHECKING:
     from v3dg.select import Selection
 
 
+class RayImage(Image):
+    """A picture that was drawn with rays.
+
+    Attributes:
+        gaussians: Number of gaussians in the selected clusters.
+    """
+
+    def __init__(self, color: Array, alpha: Array, depth: Array | None, gaussians: int) -> None:
+        super().__init__(color, alpha, depth)
+        self.gaussians = gaussians
+
+
 class RayFrame:
     """Casts rays through a scene or a bundle on one device, with buffers that are
     reused from cast to cast. It does not keep the subject alive."""
@@ -145,7 +157,7 @@ def draw_sphere(
     device: Device,
     *,
     depth: bool,
-) -> Image:
+) -> RayImage:
     """Draw an equirectangular picture; its depth is the mean distance along the ray, by
     blend weight."""
     back_color = color_of(background, "background")
@@ -162,4 +174,4 @@ def draw_sphere(
     distance = None
     if depth:
         distance = cast.range[0]
-    return Image(color, alpha, distance)
+    return RayImage(color, alpha, distance, cast.gaussians[0])
