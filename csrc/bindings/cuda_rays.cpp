@@ -41,7 +41,7 @@ class BackendRayFrame final : public backend::RayFrame {
   private:
     // Models own the memory that the frame reads.
     std::vector<std::shared_ptr<const backend::Model>> models_;
-    RayFrame frame_;
+    cuda::RayFrame frame_;
 };
 
 }  // namespace

@@ -19,8 +19,8 @@ namespace {
 constexpr size_t kMostGaussians = size_t(1) << 23;
 constexpr size_t kMostTiles = size_t(1) << 15;
 constexpr uint32_t kMostPoses = 256;
-// The index of an item's record, and of an entry, has 32 bits.
-constexpr unsigned long long kMostIndices = (1ull << 32) - kItemSize;
+// The index of an entry has 32 bits.
+constexpr unsigned long long kMostEntries = (1ull << 32) - 2;
 
 constexpr unsigned kItemThreads = 128;
 
@@ -216,7 +216,7 @@ RayLists RayFrame::project(const Subject& subject, const RaySensor& sensor, cons
     const ItemList items{.items = items_.reserve(item_capacity_, stream),
                          .counters = &counts->items,
                          .item_capacity = item_capacity_,
-                         .record_capacity = kMostIndices,
+                         .record_capacity = kMostRayGaussians,
                          .zeros = reinterpret_cast<unsigned long long*>(cleared + sizeof(Counts))};
     const RayInput input = write_items(subject, views, items, stream);
     const RayLists lists{.records = records_.reserve(record_capacity_, stream),
@@ -237,9 +237,10 @@ std::vector<int64_t> RayFrame::cast_part(const Subject& subject, const RaySensor
     const SeenBounds seen = is_scene ? subject.scene->seen_by_all() : SeenBounds{1, 1};
     const size_t num_slots = is_scene ? batch_slots(seen.instances) : 1;
     const size_t num_zeros = Cut::num_batch_zeros(num_slots * count);
-    const size_t num_cleared = sizeof(Counts) + num_zeros * sizeof(unsigned long long);
-    unsigned char* cleared = counters_.reserve(num_cleared + count * sizeof(ImageCounts), stream);
-    auto* image_counts = reinterpret_cast<ImageCounts*>(cleared + num_cleared);
+    const size_t num_before = sizeof(Counts) + num_zeros * sizeof(unsigned long long);
+    const size_t num_cleared = num_before + count * sizeof(ImageCounts);
+    unsigned char* cleared = counters_.reserve(num_cleared, stream);
+    auto* image_counts = reinterpret_cast<ImageCounts*>(cleared + num_before);
     const BatchViews views{.arrays = poses,
                            .first_camera = first,
                            .num_cameras = count,
@@ -262,19 +263,20 @@ std::vector<int64_t> RayFrame::cast_part(const Subject& subject, const RaySensor
         check(cudaMemcpyAsync(&counts, cleared, sizeof counts, cudaMemcpyDeviceToHost, stream),
               "cudaMemcpyAsync to the host");
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
-        if (std::max(counts.items.gaussians, counts.lists.entries) > kMostIndices)
-            throw std::length_error("gaussians: expected at most 4294967040 on rays, got more");
+        if (counts.items.gaussians > kMostRayGaussians || counts.lists.entries() > kMostEntries)
+            throw std::length_error(
+                "gaussians: expected at most 268435455 on rays of a CUDA device, got more");
         const auto fits = [](size_t& capacity, unsigned long long number) {
             if (number <= capacity) return true;
             capacity = number + number / 8;
             return false;
         };
         is_complete = fits(item_capacity_, counts.items.items);
-        is_complete = fits(record_capacity_, counts.lists.records) && is_complete;
-        is_complete = fits(entry_capacity_, counts.lists.entries) && is_complete;
+        is_complete = fits(record_capacity_, counts.lists.records()) && is_complete;
+        is_complete = fits(entry_capacity_, counts.lists.entries()) && is_complete;
     }
     const size_t num_tiles = count * rays.num_tiles();
-    sort_entries(lists, counts.lists.entries, num_tiles, sorted_, stream);
+    sort_entries(lists, counts.lists.entries(), num_tiles, sorted_, stream);
     cast_rays(lists, sorted_, count, rays, sensor.limits, planes, stream);
     const size_t gaussians_each = std::max<size_t>(counts.items.gaussians / count, 1);
     most_poses_ =

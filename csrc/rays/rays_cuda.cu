@@ -137,23 +137,20 @@ __device__ uint32_t sum_before(uint32_t value, uint32_t& total) {
     return sum - value;
 }
 
-// Returns the first of `count` elements that are added to a counter, in every lane.
-__device__ unsigned long long take(unsigned long long* counter, uint32_t count) {
-    unsigned long long first = 0;
-    if (threadIdx.x % 32 == 0) first = atomicAdd(counter, static_cast<unsigned long long>(count));
-    return __shfl_sync(kAllLanes, first, 0);
+// Returns the counts before `records` and `entries` were added, in every lane.
+__device__ RayListCounts add_to(RayListCounts* counts, uint32_t records, uint32_t entries) {
+    unsigned long long before = 0;
+    if (threadIdx.x % 32 == 0)
+        before = atomicAdd(&counts->both,
+                           static_cast<unsigned long long>(entries) << kRecordBits | records);
+    return {__shfl_sync(kAllLanes, before, 0)};
 }
 
-// Writes the entries of the lanes' records. All lanes of the warp must call it; a lane
-// without a record has no tiles.
+// Writes the entries of the lanes' records, `before` of which belong to earlier lanes.
+// All lanes of the warp must call it; a lane without a record has no tiles.
 __device__ void write_entries(const RayDirections& rays, const RayTiles& tiles, uint32_t num_tiles,
                               uint32_t first_tile, uint32_t distance, uint32_t record,
-                              const RayLists& out) {
-    uint32_t total;
-    const uint32_t before = sum_before(num_tiles, total);
-    if (total == 0) return;
-    const unsigned long long first = take(&out.counts->entries, total);
-    if (first + total > out.entry_capacity) return;
+                              unsigned long long first, uint32_t before, const RayLists& out) {
     const auto write = [&](const RayTiles& reached, uint32_t k, uint32_t of_image, uint32_t code,
                            uint32_t index, unsigned long long at) {
         const uint32_t key = (of_image + rays.tile(reached, k)) << out.distance_bits | code;
@@ -239,15 +236,18 @@ __global__ void __launch_bounds__(kProjectThreads, kProjectBlocks)
             }
             const unsigned kept = __ballot_sync(kAllLanes, is_kept);
             if (kept == 0) continue;
-            const unsigned long long at =
-                take(&out.counts->records, static_cast<uint32_t>(__popc(kept))) +
-                __popc(kept & ((1u << lane) - 1));
+            uint32_t num_entries;
+            const uint32_t before = sum_before(num_reached, num_entries);
+            const RayListCounts counts =
+                add_to(out.counts, static_cast<uint32_t>(__popc(kept)), num_entries);
+            const unsigned long long at = counts.records() + __popc(kept & ((1u << lane) - 1));
             if (is_kept && at < out.record_capacity) store_record(record, out.records + at);
+            if (counts.entries() + num_entries > out.entry_capacity) continue;
             uint32_t distance = 0;
             if (is_kept)
                 distance = code_of_distance(record.nearest, limits.nearest, out.distance_bits);
             write_entries(rays, tiles, num_reached, image * num_tiles, distance,
-                          static_cast<uint32_t>(at), out);
+                          static_cast<uint32_t>(at), counts.entries(), before, out);
         }
     }
 }

@@ -33,10 +33,16 @@ struct RayInput {
     }
 };
 
-// Numbers of records and entries, in device memory; both start at 0. Those beyond a
-// capacity are counted, but not stored.
+// Numbers of records and entries in one integer, so that a warp counts both at once. A
+// cast of at most kMostRayGaussians gaussians has no more records than that, which
+// leaves 36 bits for the entries.
+constexpr unsigned kRecordBits = 28;
+constexpr unsigned long long kMostRayGaussians = (1ull << kRecordBits) - 1;
 struct RayListCounts {
-    unsigned long long records, entries;
+    unsigned long long both;
+
+    V3DG_HD unsigned long long records() const { return both & kMostRayGaussians; }
+    V3DG_HD unsigned long long entries() const { return both >> kRecordBits; }
 };
 
 // The records that reach rays, and a key for each tile that a record reaches: from the
@@ -46,6 +52,8 @@ struct RayListCounts {
 struct RayLists {
     RayRecord* records;
     uint64_t* entries;
+    // In device memory, initially 0. Records and entries beyond a capacity are counted,
+    // but not stored.
     RayListCounts* counts;
     unsigned long long record_capacity, entry_capacity;
     unsigned distance_bits;
