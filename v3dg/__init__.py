@@ -45,7 +45,7 @@ from v3dg.render import (
     first_camera,
     render,
 )
-from v3dg.scan import Scan, scan
+from v3dg.scan import Scan, ScanBatch, scan
 from v3dg.scene import Scene
 from v3dg.scene.file import read_scene, write_scene
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
@@ -75,6 +75,6 @@ __all__ += [
 ]
 __all__ += ["MESH", "BatchPlanes", "CameraBatch", "MeshLayer", "RenderedBatch"]
 __all__ += ["draw_panorama", "first_camera"]
-__all__ += ["EquirectangularCamera", "Lidar", "Scan", "scan"]
+__all__ += ["EquirectangularCamera", "Lidar", "Scan", "ScanBatch", "scan"]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]
 __all__ += ["read_usd_scene", "write_site", "write_streamed_sog", "write_tiles", "write_usd"]

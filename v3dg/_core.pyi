@@ -390,63 +390,66 @@ class Ellipses:
     def radii(self) -> Array: ...
 
 class RaySensor:
-    """A sensor at one pose: rays of ascending azimuths and elevations. The camera has x
-    forward, y left and z up."""
+    """A sensor without a pose: rays of ascending azimuths and elevations. `rows` and
+    `columns` are their places in the picture. The sensor has x forward, y left and z
+    up."""
 
     def __init__(
         self,
-        camera: Camera,
+        *,
         azimuth: Float64,
         elevation: Float64,
-        *,
+        rows: Int32,
+        columns: Int32,
+        near: float,
         far: float,
         spacing: float,
         min_transmittance: float,
     ) -> None: ...
 
 class Cast:
-    """The results of casting rays: arrays of H rows and W columns."""
+    """The results of casting rays at B poses: arrays of H rows and W columns, or
+    None."""
 
     @property
-    def color(self) -> Float32: ...
+    def color(self) -> Array: ...
     @property
-    def alpha(self) -> Float32: ...
+    def alpha(self) -> Array: ...
     @property
-    def range(self) -> Float32: ...
+    def range(self) -> Array: ...
     @property
-    def returns(self) -> Float32: ...
+    def intensity(self) -> Array: ...
     @property
-    def gaussians(self) -> int: ...
+    def second_range(self) -> Array: ...
     @property
-    def tolerance_px2(self) -> float: ...
+    def second_intensity(self) -> Array: ...
     @property
-    def select_ms(self) -> float: ...
-    @property
-    def records(self) -> int: ...
-    @property
-    def entries(self) -> int: ...
-    @property
-    def project_ms(self) -> float: ...
-    @property
-    def bin_ms(self) -> float: ...
-    @property
-    def blend_ms(self) -> float: ...
+    def gaussians(self) -> list[int]: ...
 
-def cast_scene(
-    scene: ResidentScene,
-    models: list[Model],
-    sensor: RaySensor,
-    rule: Rule,
-    returns: tuple[float, float] | None = None,
-) -> Cast: ...
-def cast_model(
-    model: Model,
-    sensor: RaySensor,
-    *,
-    filter_px2: float,
-    antialiased: bool,
-    returns: tuple[float, float] | None = None,
-) -> Cast: ...
+class RayFrame:
+    """Casts the rays of sensors on one device."""
+
+    def __init__(self, device: int) -> None: ...
+    def set_models(self, models: list[Model]) -> None: ...
+    def cast_scene(
+        self,
+        scene: ResidentScene,
+        sensor: RaySensor,
+        viewmats: Array,
+        rule: Rule,
+        returns: tuple[float, float] | None = None,
+    ) -> Cast: ...
+    def cast_model(
+        self,
+        model: Model,
+        sensor: RaySensor,
+        viewmats: Array,
+        *,
+        filter_px2: float,
+        antialiased: bool,
+        returns: tuple[float, float] | None = None,
+    ) -> Cast: ...
+
 def rasterize(
     gaussians: Rows,
     camera: Camera,

@@ -20,6 +20,9 @@ struct Reals {
     bool are_double;
 };
 
+// Borrows an array of float64 or, on a device, of float32.
+Reals reals_of(Device device, const py::object& array, const char* name, Shape shape);
+
 // B cameras of one size. The arrays are on the host or on one device. They are read
 // when a batch is drawn, so they may change in place between batches.
 class BoundCameras {

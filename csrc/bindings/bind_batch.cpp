@@ -15,13 +15,6 @@ bool has_dtype(const py::object& array, const char* name) {
     return dtype == name || dtype == std::string("torch.") + name;
 }
 
-// Borrows an array of float64 or, on a device, of float32.
-Reals reals_of(Device device, const py::object& array, const char* name, Shape shape) {
-    if (device != kHost && has_dtype(array, "float32"))
-        return {.data = span_on<const float>(device, array, name, shape).data, .are_double = false};
-    return {.data = span_on<const double>(device, array, name, shape).data, .are_double = true};
-}
-
 const char* expected_of(CameraFault fault) {
     switch (fault) {
         case CameraFault::not_finite: return "finite numbers";
@@ -46,6 +39,12 @@ py::object fault_of_cameras(const py::array& viewmats, const py::array& K) {
 }
 
 }  // namespace
+
+Reals reals_of(Device device, const py::object& array, const char* name, Shape shape) {
+    if (device != kHost && has_dtype(array, "float32"))
+        return {.data = span_on<const float>(device, array, name, shape).data, .are_double = false};
+    return {.data = span_on<const double>(device, array, name, shape).data, .are_double = true};
+}
 
 BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int height, double near,
                            py::object environments,

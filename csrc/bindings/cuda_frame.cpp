@@ -99,9 +99,17 @@ class BackendScene final : public backend::Scene {
     mutable Cut cut_;
 };
 
+}  // namespace
+
 const SceneTables& tables_of(const backend::Scene& scene) {
     return static_cast<const BackendScene&>(scene).tables();
 }
+
+const DeviceModel& model_on_device(const backend::Model& model) {
+    return static_cast<const BackendModel&>(model).on_device();
+}
+
+namespace {
 
 class BackendPool final : public backend::Pool {
   public:

@@ -14,14 +14,14 @@ from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_cam
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
-from v3dg.image import Image, RenderedImage
+from v3dg.image import RenderedImage
 from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
-from v3dg.render.rays import check_rays, draw_sphere
+from v3dg.render.rays import RayImage, check_rays, draw_sphere
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
 from v3dg.render.sensor import Channel, MeshLayer, sensor_of
@@ -65,7 +65,7 @@ def render(
 @overload
 def render(
     subject: Subject | File, camera: EquirectangularCamera, **options: Unpack[_Options]
-) -> Image: ...
+) -> RayImage: ...
 @overload
 def render(
     subject: Subject | File, camera: Sequence[Camera], **options: Unpack[_Options]
@@ -87,7 +87,7 @@ def render(
     mesh: MeshLayer | None = None,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
-) -> Image | _Pictures:
+) -> RayImage | _Pictures:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
@@ -106,10 +106,10 @@ def render(
             The two eyes of a stereo camera share one cut and one frame. Their two
             pictures have common statistics, which are sums, except for the number of
             selected gaussians. None means the first camera of a scene's file, else the
-            camera of `first_camera`. An `EquirectangularCamera` is drawn on the CPU
-            with all gaussians resident, without statistics, and takes none
-            of `budget`, `cut`, `min_transmittance`, `mesh`, channels other than
-            "depth", and a number of bytes as `memory`.
+            camera of `first_camera`. An `EquirectangularCamera` is drawn with all
+            gaussians resident, without statistics, and takes none of `budget`, `cut`,
+            `min_transmittance`, `mesh`, channels other than "depth", and a number of
+            bytes as `memory`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -147,11 +147,13 @@ def render(
     """
     opened_subject, camera = _with_camera(subject, camera)
     cut_request = CutRequest(tolerance, budget, min_level, fade)
+    chosen_device = _device.resolve(device)
     if isinstance(camera, EquirectangularCamera):
         with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=_device.CPU)
-        check_rays(color_by, cut, sensor, min_transmittance, device, memory)
-        return draw_sphere(opened_subject, camera, cut_request, background, depth=with_depth)
-    chosen_device = _device.resolve(device)
+        check_rays(color_by, cut, sensor, min_transmittance, memory)
+        return draw_sphere(
+            opened_subject, camera, cut_request, background, chosen_device, depth=with_depth
+        )
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
     with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=chosen_device)
