@@ -86,9 +86,9 @@ size_t rounded_up(size_t bytes, size_t step) { return (bytes + step - 1) / step 
 size_t granularity_of(int device) {
     const CUmemAllocationProp properties = properties_of(device);
     size_t bytes = 0;
-    check_driver(driver().get_granularity(&bytes, &properties,
-                                          CU_MEM_ALLOC_GRANULARITY_RECOMMENDED),
-                 "cuMemGetAllocationGranularity");
+    check_driver(
+        driver().get_granularity(&bytes, &properties, CU_MEM_ALLOC_GRANULARITY_RECOMMENDED),
+        "cuMemGetAllocationGranularity");
     return bytes;
 }
 
