@@ -65,8 +65,12 @@ Frame::Frame(Keeps keeps)
     for (const auto& slot : slots_) free_slots_.push_back(slot.get());
 }
 
-Frame::~Frame() {
-    if (grows_in_place_) busy_.wait();  // before memory is unmapped
+Frame::~Frame() { wait_before_unmapping(); }
+
+void Frame::wait_before_unmapping() const {
+    if (!grows_in_place_) return;
+    const KeepsCaptures keeps_captures;
+    busy_.wait();
 }
 
 template <class T>
@@ -147,7 +151,7 @@ void Frame::enlarge(const FrameCounters& counters) {
 }
 
 void Frame::release_large_buffers() {
-    if (grows_in_place_) busy_.wait();  // before memory is unmapped
+    wait_before_unmapping();
     records_.release();
     boxes_ = {};
     large_.release();

@@ -132,6 +132,8 @@ class Frame {
     T* room(GrowingBuffer<T>& buffer, size_t size, const Drawing& drawing);
     // Frees the large buffers.
     void release_large_buffers();
+    // Waits for the device if it may use memory that is unmapped when it is freed.
+    void wait_before_unmapping() const;
 
     const Keeps keeps_;
     // Whether the large buffers grow in place. With a tape they do not, because other
