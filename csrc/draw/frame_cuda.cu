@@ -55,17 +55,38 @@ constexpr size_t kEllipseFloats = 8,
 // frames are in flight or captured.
 constexpr size_t kSlots = 8;
 
-Frame::Frame(Keeps keeps) : keeps_(keeps) {
+Frame::Frame(Keeps keeps)
+    : keeps_(keeps),
+      grows_in_place_(keeps == Keeps::nothing && MappedMemory::is_supported()),
+      records_(grows_in_place_),
+      large_(grows_in_place_),
+      entries_(grows_in_place_),
+      scratch_(grows_in_place_) {
     for (size_t i = 0; i < kSlots; ++i) slots_.push_back(std::make_unique<Slot>());
     for (const auto& slot : slots_) free_slots_.push_back(slot.get());
 }
 
-Frame::~Frame() = default;
+Frame::~Frame() { wait_before_unmapping(); }
+
+void Frame::wait_before_unmapping() const {
+    if (!grows_in_place_) return;
+    const KeepsCaptures keeps_captures;
+    busy_.wait();
+}
 
 template <class T>
 T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
     if (size > buffer.capacity() && was_captured_ && !drawing.is_captured_)
         retired_.push_back(std::make_shared<DeviceBuffer<T>>(std::move(buffer)));
+    return buffer.reserve(size, drawing.stream_);
+}
+
+template <class T>
+T* Frame::room(GrowingBuffer<T>& buffer, size_t size, const Drawing& drawing) {
+    const bool moves = size > buffer.capacity() && !buffer.is_in_place();
+    if (moves && was_captured_ && !drawing.is_captured_)
+        retired_.push_back(
+            std::make_shared<GrowingBuffer<T>>(std::exchange(buffer, GrowingBuffer<T>())));
     return buffer.reserve(size, drawing.stream_);
 }
 
@@ -92,10 +113,10 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Growing a buffer takes as long as drawing several frames, and a frame that
-    // exceeds a buffer is drawn twice. So buffers grow before a moving camera exceeds
-    // them. All buffers that are nearly full grow together, by more than the counts
-    // require.
+    // Growing a buffer that moves takes as long as drawing several frames, and a frame
+    // that exceeds a buffer is drawn twice. So buffers grow before a moving camera
+    // exceeds them. All buffers that are nearly full grow together, by more than the
+    // counts require; by less if they grow in place.
     const auto is_full = [](unsigned long long capacity, unsigned long long count,
                             unsigned free_part) { return count > capacity - capacity / free_part; };
     const bool grows = is_full(capacity_.items, counters.items, 32) ||
@@ -105,8 +126,9 @@ void Frame::enlarge(const FrameCounters& counters) {
                        is_full(capacity_.spread, counters.spread, 32);
     if (!grows) return;
     const Capacity before = capacity_;
-    const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
-        if (is_full(capacity, count, 8)) capacity = std::max(capacity, count + count / 8);
+    const unsigned part = grows_in_place_ ? 16 : 8;
+    const auto grow = [is_full, part](unsigned long long& capacity, unsigned long long count) {
+        if (is_full(capacity, count, part)) capacity = std::max(capacity, count + count / part);
     };
     // If the gaussians exceed their capacity, no entries were counted, so estimate
     // their number: most scenes have one or two entries per gaussian.
@@ -122,15 +144,21 @@ void Frame::enlarge(const FrameCounters& counters) {
     // With a tape, the caller receives the counts before lists are spread. So the
     // buffer must have room for all entries.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
-    if (was_captured_ || capacity_ == before) return;
+    if (was_captured_ || grows_in_place_ || capacity_ == before) return;
     // Free the largest buffers before allocating larger ones, and return their memory
     // to the device, because the memory pool cannot reuse the smaller blocks.
-    records_ = {};
+    release_large_buffers();
+    trim_pool(last_stream_);
+}
+
+void Frame::release_large_buffers() {
+    wait_before_unmapping();
+    records_.release();
     normals_ = {};
     boxes_ = {};
-    entries_ = {};
-    scratch_ = {};
-    trim_pool(last_stream_);
+    large_.release();
+    entries_.release();
+    scratch_.release();
 }
 
 void Frame::release_buffers() {
@@ -139,15 +167,11 @@ void Frame::release_buffers() {
     items_ = {};
     item_records_ = {};
     item_tiles_ = {};
-    records_ = {};
     normals_ = {};
     instances_ = {};
     source_ = {};
     order_ = {};
-    boxes_ = {};
-    large_ = {};
-    entries_ = {};
-    scratch_ = {};
+    release_large_buffers();
     trim_pool(last_stream_);
 }
 

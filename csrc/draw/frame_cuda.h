@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "base/device.h"
+#include "base/mapped_memory.h"
 #include "draw/sensed_records.h"
 #include "frame/tile_list.h"
 #include "project/project_cuda.h"
@@ -137,21 +138,31 @@ class Frame {
     Slot* take_slot(bool capturing);
     template <class T>
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
+    template <class T>
+    T* room(GrowingBuffer<T>& buffer, size_t size, const Drawing& drawing);
+    // Frees the large buffers.
+    void release_large_buffers();
+    // Waits for the device if it may use memory that is unmapped when it is freed.
+    void wait_before_unmapping() const;
 
     const Keeps keeps_;
+    // Whether the large buffers grow in place. With a tape they do not, because other
+    // streams may read a tape when its frame is destroyed.
+    const bool grows_in_place_;
     static constexpr Capacity kFirstCapacity{64, 4096, 4096, 4096, 4096};
     Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
-    DeviceBuffer<float> records_;
     // Normals and instances of records, for channels.
     DeviceBuffer<float> normals_;
     DeviceBuffer<int32_t> instances_;
-    DeviceBuffer<RecordBox> boxes_;
     DeviceBuffer<ItemTiles> item_tiles_;
-    DeviceBuffer<LargeRecord> large_;
-    DeviceBuffer<TileEntry> entries_;
-    DeviceBuffer<unsigned long long> scratch_;  // tile lists of small records, later spread lists
+    // The large buffers.
+    GrowingBuffer<float> records_;
+    DeviceBuffer<RecordBox> boxes_;  // of a tape
+    GrowingBuffer<LargeRecord> large_;
+    GrowingBuffer<TileEntry> entries_;
+    GrowingBuffer<unsigned long long> scratch_;  // tile lists of small records, later spread lists
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;
