@@ -112,7 +112,7 @@ class ScanBatch(Sequence[Scan]):
     def __getitem__(self, number: slice) -> list[Scan]: ...
     def __getitem__(self, number: int | slice) -> Scan | list[Scan]:
         if isinstance(number, slice):
-            return [self[each] for each in range(*number.indices(len(self)))]
+            return [self[index] for index in range(*number.indices(len(self)))]
         if not -len(self) <= number < len(self):
             raise IndexError(f"number: expected one of {len(self)} scans, got {number}")
         return Scan(

@@ -1,7 +1,7 @@
 #pragma once
 
-// Casts the rays of a spherical sensor through a scene: the sensor, and the host's half.
-// cast_scene_cuda.h has the half of CUDA devices.
+// Casts the rays of a spherical sensor through a scene: the sensor, and the function of
+// the host. cast_scene_cuda.h has that of CUDA devices.
 
 #include <memory>
 

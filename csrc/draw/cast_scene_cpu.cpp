@@ -11,11 +11,8 @@ CastCounts cpu::cast_scene(const HostScene& scene, const RaySensor& sensor, cons
     const double start = now();
     rule.culls = false;
     SelectOutput cut;
-    cpu::select({.bundles = scene.tables,
-                 .instances = scene.instances,
-                 .eyes = camera,
-                 .rule = rule},
-                cut);
+    cpu::select(
+        {.bundles = scene.tables, .instances = scene.instances, .eyes = camera, .rule = rule}, cut);
     const double select_seconds = now() - start;
     const CutDraws draws(scene, camera, pairs_of(cut));
     return {.gaussians = cut.num_gaussians,

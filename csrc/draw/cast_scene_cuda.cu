@@ -14,8 +14,8 @@ namespace cuda {
 
 namespace {
 
-// Limits of a part, which bound its memory: a record has 128 bytes. Keys of entries have
-// at least 16 bits for distances if a part has at most kMostTiles tiles.
+// Limits of a part, which bound its memory: a record has 128 bytes. Keys of entries
+// have at least 16 bits for distances if a part has at most kMostTiles tiles.
 constexpr size_t kMostGaussians = size_t(1) << 23;
 constexpr size_t kMostTiles = size_t(1) << 15;
 constexpr uint32_t kMostPoses = 256;
@@ -167,9 +167,8 @@ std::vector<int64_t> RayFrame::cast(const Subject& subject, const RaySensor& sen
         const auto of_tiles = static_cast<uint32_t>(std::max<size_t>(kMostTiles / num_tiles, 1));
         const uint32_t count = std::min({most_poses_, of_tiles, poses.count - first});
         try {
-            const std::vector<int64_t> part =
-                cast_part(subject, sensor, arrays, first, count,
-                          planes.from(first * num_rays), stream);
+            const std::vector<int64_t> part = cast_part(subject, sensor, arrays, first, count,
+                                                        planes.from(first * num_rays), stream);
             gaussians.insert(gaussians.end(), part.begin(), part.end());
             first += count;
         } catch (const OutOfMemory&) {

@@ -47,8 +47,8 @@ class RayFrame {
     // pose. `rule` has no budget. Throws OutOfMemory, or std::length_error if one pose
     // has too many rays or entries.
     std::vector<int64_t> cast_scene(const SceneTables& scene, const RaySensor& sensor,
-                                    const RayPoses& poses, SelectRule rule,
-                                    const RayPlanes& planes, cudaStream_t stream);
+                                    const RayPoses& poses, SelectRule rule, const RayPlanes& planes,
+                                    cudaStream_t stream);
 
     // Casts all rays through all gaussians of one asset.
     std::vector<int64_t> cast_model(const GaussianRows<const float>& rows,

@@ -104,7 +104,8 @@ struct RayDirections {
         const int columns = tile_columns(), row = range.row0 / kRayTileRows;
         const int column = range.column0 / kRayTileColumns;
         int last = range.column1 / kRayTileColumns;
-        // Columns behind the last go on from the first tile, which may be reached twice.
+        // Columns behind the last continue from the first tile, which may be reached
+        // twice.
         if (range.column1 >= num_columns())
             last = columns + (range.column1 - num_columns()) / kRayTileColumns;
         if (last > column + columns - 1) last = column + columns - 1;

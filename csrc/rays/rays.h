@@ -24,8 +24,8 @@ class RayGrid {
   public:
     // `row_place` and `column_place` are the row and the column of the picture for each
     // angle.
-    RayGrid(Span<const double> azimuth, Span<const double> elevation,
-            Span<const int32_t> row_place, Span<const int32_t> column_place);
+    RayGrid(Span<const double> azimuth, Span<const double> elevation, Span<const int32_t> row_place,
+            Span<const int32_t> column_place);
     RayGrid(const RayGrid&) = delete;
     RayGrid& operator=(const RayGrid&) = delete;
 
@@ -89,8 +89,7 @@ struct RayScratch {
 
 // Appends the records of gaussians [skip, skip + count) of a draw that reach a ray.
 V3DG_DECLARE_PER_ISA(void project_to_rays(const Draw<float>& draw, uint64_t skip, uint64_t count,
-                                          const RayDirections& rays,
-                                          const RayLimits& limits,
+                                          const RayDirections& rays, const RayLimits& limits,
                                           std::vector<RayRecord>& records))
 
 // Blends the rays of a tile. The low 32 bits of an entry are the index of a record;

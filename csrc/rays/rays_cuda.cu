@@ -5,12 +5,12 @@
 // Results do not depend on them: entries are sorted by tile and distance, and the hits
 // of a ray by distance, ties in the order of the draws.
 //
-// A block blends a tile, a thread per ray. It reads the entries of its tile in the order
-// of the lower bounds of their distances. Each ray has a window of the nearest hits that
-// are not blended yet. A hit is blended when no later entry can have a hit in front of
-// it. If the window is full, the farthest hit is dropped, and the ray ends in front of
-// it; another pass over the entries then goes on from there. So the order of hits is
-// exact, in a bounded memory.
+// A block blends a tile, a thread per ray. It reads the entries of its tile in the
+// order of the lower bounds of their distances. Each ray has a window of the nearest
+// hits that are not blended yet. A hit is blended when no later entry can have a hit in
+// front of it. If the window is full, the farthest hit is dropped, and the ray stops in
+// front of it; another pass over the entries then continues from there. So the order of
+// hits is exact, in bounded memory.
 
 #include "rays/rays_cuda.h"
 
@@ -205,7 +205,8 @@ __global__ void __launch_bounds__(kProjectThreads, kProjectBlocks)
             if (is_kept) {
                 const uint32_t g = item.first + k / num_sharers;
                 const unsigned sharer =
-                    item.sharers == 0 ? 0 : __fns(sharers, 0, static_cast<int>(k % num_sharers) + 1);
+                    item.sharers == 0 ? 0
+                                      : __fns(sharers, 0, static_cast<int>(k % num_sharers) + 1);
                 const ModelView<float>& view = placed[sharer].view;
                 const uint32_t cluster = Reader::cluster_of(model, item, g);
                 const Gaussian3d<float> gaussian = Reader::load(model, cluster, g, record.color);
@@ -448,13 +449,12 @@ __global__ void __launch_bounds__(kRayTileSize)
             __syncthreads();
             bool reaches = false;
             if (lane < count) {
-                const RayRange& range =
-                    reinterpret_cast<const RayRecord*>(loaded[lane])->range;
+                const RayRange& range = reinterpret_cast<const RayRecord*>(loaded[lane])->range;
                 const int last = warp_column + kWarpColumns - 1;
-                const bool is_in_rows =
-                    warp_row <= range.row1 && warp_row + kWarpRows > range.row0;
-                const bool is_in_columns = (warp_column <= range.column1 && last >= range.column0) ||
-                                           warp_column + rays.num_columns() <= range.column1;
+                const bool is_in_rows = warp_row <= range.row1 && warp_row + kWarpRows > range.row0;
+                const bool is_in_columns =
+                    (warp_column <= range.column1 && last >= range.column0) ||
+                    warp_column + rays.num_columns() <= range.column1;
                 reaches = is_in_rows && is_in_columns;
             }
             unsigned left = __ballot_sync(kAllLanes, reaches);
@@ -472,8 +472,7 @@ __global__ void __launch_bounds__(kRayTileSize)
                 add_hit({hit.range, alpha, static_cast<uint32_t>(keys[e])}, record.order,
                         bound_of(keys[e]));
             }
-            if (!is_over)
-                blend_before(base + kLoaded < end ? bound_of(keys[kLoaded]) : INFINITY);
+            if (!is_over) blend_before(base + kLoaded < end ? bound_of(keys[kLoaded]) : INFINITY);
         }
         if (!is_over) blend_before(INFINITY);
         is_over = is_over || !is_limited;
@@ -508,13 +507,12 @@ void project_to_rays(const RayInput& in, const RayDirections& rays, const RayLim
 void sort_entries(const RayLists& lists, size_t num_entries, size_t num_tiles,
                   RaySortBuffers& buffers, cudaStream_t stream) {
     uint64_t* sorted = buffers.sorted.reserve(lists.entry_capacity, stream);
-    const auto end_bit =
-        static_cast<int>(32 + lists.distance_bits + std::bit_width(num_tiles - 1));
+    const auto end_bit = static_cast<int>(32 + lists.distance_bits + std::bit_width(num_tiles - 1));
     const auto sort = [&](void* scratch, size_t& bytes) {
-        check(cub::DeviceRadixSort::SortKeys(scratch, bytes, lists.entries, sorted,
-                                             static_cast<int64_t>(num_entries), 32, end_bit,
-                                             stream),
-              "sort of rays");
+        check(
+            cub::DeviceRadixSort::SortKeys(scratch, bytes, lists.entries, sorted,
+                                           static_cast<int64_t>(num_entries), 32, end_bit, stream),
+            "sort of rays");
     };
     size_t bytes = 0;
     sort(nullptr, bytes);

@@ -16,8 +16,8 @@ namespace cuda {
 constexpr unsigned kKeyBits = 32, kLeastDistanceBits = 8;
 constexpr size_t kMostRayTiles = (size_t(1) << (kKeyBits - kLeastDistanceBits)) - 1;
 
-// The gaussians of a cast. Each model is in `rows` or in `coded`, and empty in the other
-// list. An unused list is null.
+// The gaussians of a cast. Each model is in `rows` or in `coded`, and empty in the
+// other list. An unused list is null.
 struct RayInput {
     const GaussianRows<const float>* rows;
     const CodedGaussians* coded;

@@ -26,8 +26,8 @@ __device__ inline int32_t environment_of(const CameraArrays& arrays, uint32_t b)
     return is_one ? static_cast<int32_t>(environment) : kMostEnvironment + 1;
 }
 
-__device__ inline BatchCamera read_camera(const CameraArrays& arrays, const EnvironmentTable& environments,
-                                   uint32_t b) {
+__device__ inline BatchCamera read_camera(const CameraArrays& arrays,
+                                          const EnvironmentTable& environments, uint32_t b) {
     double viewmat[16], K[9];
     for (int k = 0; k < 16; ++k)
         viewmat[k] = number_of(arrays.viewmats, arrays.are_viewmats_double, 16 * size_t(b) + k);

@@ -273,35 +273,32 @@ def _drawn(
         faces.append(image)
         return image
 
-    def draw_around(camera: Camera) -> RayImage:
-        sphere = EquirectangularCamera.level(camera, direction_of(style.up), options.view.size[0])
-        device = options.device
-        return render(renderer.subject, sphere, **cut, background=background, device=device)
-
     casts_rays = _casts_rays(options, renderer)
+    direction = direction_of(style.up)
+    panorama_width = options.view.size[0]
     for name, camera in counted(cameras.items(), len(cameras), "render", show):
         faces.clear()
         image: Image
-        costs: JsonObject
         if casts_rays:
-            around = draw_around(camera)
-            image = around
-            costs = {"gaussians_selected": around.gaussians}
+            sphere = EquirectangularCamera.level(camera, direction, panorama_width)
+            image = render(
+                renderer.subject, sphere, **cut, background=background, device=options.device
+            )
         elif options.is_panorama:
-            image = draw_panorama(draw, camera, direction_of(style.up), options.view.size[0])
-            costs = _costs(faces)
+            image = draw_panorama(draw, camera, direction, panorama_width)
         else:
             image = draw(camera)
-            costs = _costs(faces)
         height, width = image.alpha.shape
         picture: JsonObject = {"camera": name, "width": width, "height": height}
-        pictures.append({**picture, **costs})
+        pictures.append({**picture, **_costs(image, faces)})
         yield image
 
 
-def _costs(faces: list[RenderedImage]) -> JsonObject:
+def _costs(image: Image, faces: list[RenderedImage]) -> JsonObject:
     """Return the costs of a picture. For a panorama of pinholes, they are the sums over
     its sides."""
+    if isinstance(image, RayImage):
+        return {"gaussians_selected": image.gaussians}
     stats = [face.stats for face in faces]
     costs: JsonObject = stats[0]._asdict()
     for name in ("gaussians_selected", "gaussians_in_frustum", "select_ms", "draw_ms"):

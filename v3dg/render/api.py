@@ -21,7 +21,7 @@ from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
-from v3dg.render.rays import RayImage, check_rays, draw_sphere
+from v3dg.render.rays import RayImage, check_rays, draw_rays
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
 from v3dg.render.sensor import Channel, MeshLayer, sensor_of
@@ -147,13 +147,11 @@ def render(
     """
     opened_subject, camera = _with_camera(subject, camera)
     cut_request = CutRequest(tolerance, budget, min_level, fade)
-    chosen_device = _device.resolve(device)
     if isinstance(camera, EquirectangularCamera):
         with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=_device.CPU)
         check_rays(color_by, cut, sensor, min_transmittance, memory)
-        return draw_sphere(
-            opened_subject, camera, cut_request, background, chosen_device, depth=with_depth
-        )
+        return draw_rays(opened_subject, camera, cut_request, background, device, depth=with_depth)
+    chosen_device = _device.resolve(device)
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
     with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=chosen_device)

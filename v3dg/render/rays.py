@@ -149,28 +149,29 @@ def _cast_asset(
     )
 
 
-def draw_sphere(
+def draw_rays(
     subject: Subject,
     camera: EquirectangularCamera,
     cut: CutRequest,
     background: Sequence[float],
-    device: Device,
+    device: str | Device,
     *,
     depth: bool,
 ) -> RayImage:
     """Draw an equirectangular picture; its depth is the mean distance along the ray, by
     blend weight."""
     back_color = color_of(background, "background")
-    cast = cast_rays(subject, camera.core, camera.sensor_viewmat[None], cut, device)
+    chosen_device = _device.resolve(device)
+    cast = cast_rays(subject, camera.core, camera.sensor_viewmat[None], cut, chosen_device)
     color = cast.color[0]
     alpha = cast.alpha[0]
     if any(back_color):
-        behind: Array = np.array(back_color, np.float32)
-        if device.is_cuda:
+        backdrop: Array = np.array(back_color, np.float32)
+        if chosen_device.is_cuda:
             import torch
 
-            behind = torch.as_tensor(behind, device=str(device))
-        color += (1 - alpha[..., None]) * behind
+            backdrop = torch.as_tensor(backdrop, device=str(chosen_device))
+        color += (1 - alpha[..., None]) * backdrop
     distance = None
     if depth:
         distance = cast.range[0]
