@@ -16,7 +16,7 @@ namespace {
 
 // A scene on the host. It has no data, because selection reads the arrays of
 // SceneState.
-class HostScene final : public backend::Scene {
+class HostBackendScene final : public backend::Scene {
   public:
     void set_bundles(const SceneState&, const Work&) override {}
     void set_instances(SceneState& state, const Work&) override { read_poses(state); }
@@ -154,7 +154,7 @@ class HostBackend final : public Backend {
         return std::make_shared<HostPalette>(table, sh);
     }
     std::unique_ptr<backend::Scene> make_scene(const Work&) const override {
-        return std::make_unique<HostScene>();
+        return std::make_unique<HostBackendScene>();
     }
     PoolDemands pool_demands(int max_sh_degree) const override {
         // The host uses 32-bit indices for SH codes, separately for each degree.
