@@ -72,7 +72,8 @@ class SplatCamera:
 
     Args:
         model: A finalized model.
-        width, height: Size of the pictures in px.
+        width: Width of the pictures in px.
+        height: Height of the pictures in px.
         camera_fov: Vertical field of view in radians; or K.
         K: (3, 3), or (V, 3, 3) for views: focal lengths and principal points in px.
         near: As in `v3dg.CameraBatch`.
