@@ -39,6 +39,8 @@ except ImportError as error:
         "pip install 'isaaclab>=3.0'"
     ) from error
 
+from v3dg.simulators._streams import torch_in_order
+
 if TYPE_CHECKING:
     import torch
     from isaaclab.sensors.camera.camera_data import CameraData
@@ -214,16 +216,18 @@ class SplatRenderer(BaseRenderer):
         their intrinsics."""
         import torch
 
-        columns = rotations_of(orientations.torch).transpose(1, 2)
-        axes = torch.stack([-columns[:, 1], -columns[:, 2], columns[:, 0]], dim=1)
-        write_viewmats(render_data.viewmats, positions.torch, axes)
-        render_data.K.copy_(intrinsics.torch)
+        with torch_in_order(positions.warp.device):
+            columns = rotations_of(orientations.torch).transpose(1, 2)
+            axes = torch.stack([-columns[:, 1], -columns[:, 2], columns[:, 0]], dim=1)
+            write_viewmats(render_data.viewmats, positions.torch, axes)
+            render_data.K.copy_(intrinsics.torch)
 
     def update_camera_intrinsics(
         self, render_data: RenderData, intrinsics: warp.array, parameters: warp.array
     ) -> None:
         """Set the intrinsics of the cameras. The physical parameters are not used."""
-        render_data.K.copy_(warp.to_torch(intrinsics))
+        with torch_in_order(intrinsics.device):
+            render_data.K.copy_(warp.to_torch(intrinsics))
 
     def render(self, render_data: RenderData) -> None:
         """Draw the pictures of all environments into the outputs."""
@@ -236,14 +240,15 @@ class SplatRenderer(BaseRenderer):
             environments=np.arange(len(render_data.K)),
         )
         used = {_CHANNELS[kind] for kind in render_data.outputs if kind in _CHANNELS}
-        pictures = self._renderer_on(render_data.viewmats).render_batch(
-            cameras,
-            background=render_data.background,
-            tolerance=self.cfg.tolerance,
-            channels=tuple(sorted(used)),
-        )
-        for kind, target in render_data.outputs.items():
-            target.copy_(self._output_of(kind, pictures, render_data))
+        with torch_in_order(warp.device_from_torch(render_data.viewmats.device)):
+            pictures = self._renderer_on(render_data.viewmats).render_batch(
+                cameras,
+                background=render_data.background,
+                tolerance=self.cfg.tolerance,
+                channels=tuple(sorted(used)),
+            )
+            for kind, target in render_data.outputs.items():
+                target.copy_(self._output_of(kind, pictures, render_data))
 
     def _renderer_on(self, tensor: torch.Tensor) -> Renderer:
         if self._renderer is None:

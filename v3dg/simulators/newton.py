@@ -22,6 +22,8 @@ try:
 except ImportError as error:
     raise ImportError(_extras.missing("newton")) from error
 
+from v3dg.simulators._streams import torch_in_order
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -67,8 +69,7 @@ class SplatCamera:
     be added to `scene` and attached to bodies. Other shapes are not drawn: pass
     pictures of Newton's `SensorCamera` as `mesh` (see `mesh_layer`).
 
-    Everything happens on the model's device, without waiting for a CUDA device after
-    the first picture.
+    Everything happens on the model's device, in order with warp's current stream.
 
     Args:
         model: A finalized model.
@@ -219,25 +220,27 @@ class SplatCamera:
         Raises:
             ValueError: An argument has another shape, or is on another device.
         """
-        self._move(state)
-        cameras = self._cameras(camera_transforms, world_indices)
-        images: dict[Channel, tuple[warp.array | None, ...]] = {
-            "depth": (depth_image, forward_depth_image),
-            "instance": (shape_index_image,),
-            "normal": (normal_image,),
-        }
-        channels = [name for name, used in images.items() if used.count(None) < len(used)]
-        pictures = self._draw(cameras, channels, mesh)
-        if color_image is not None:
-            _write(color_image, "color_image", _packed(pictures))
-        if depth_image is not None:
-            _write(depth_image, "depth_image", pictures.distance)
-        if forward_depth_image is not None:
-            _write(forward_depth_image, "forward_depth_image", pictures.depth)
-        if shape_index_image is not None:
-            _write(shape_index_image, "shape_index_image", self._shape_indices(pictures.instance))
-        if normal_image is not None:
-            _write(normal_image, "normal_image", _in_world(pictures.normal, cameras))
+        with torch_in_order(self._model.device):
+            self._move(state)
+            cameras = self._cameras(camera_transforms, world_indices)
+            images: dict[Channel, tuple[warp.array | None, ...]] = {
+                "depth": (depth_image, forward_depth_image),
+                "instance": (shape_index_image,),
+                "normal": (normal_image,),
+            }
+            channels = [name for name, used in images.items() if used.count(None) < len(used)]
+            pictures = self._draw(cameras, channels, mesh)
+            if color_image is not None:
+                _write(color_image, "color_image", _packed(pictures))
+            if depth_image is not None:
+                _write(depth_image, "depth_image", pictures.distance)
+            if forward_depth_image is not None:
+                _write(forward_depth_image, "forward_depth_image", pictures.depth)
+            if shape_index_image is not None:
+                shapes = self._shape_indices(pictures.instance)
+                _write(shape_index_image, "shape_index_image", shapes)
+            if normal_image is not None:
+                _write(normal_image, "normal_image", _in_world(pictures.normal, cameras))
         return pictures
 
     def _draw(
