@@ -2,6 +2,7 @@
 
 import os
 import sys
+from ctypes.util import find_library
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,16 @@ import pytest
 import v3dg
 from v3dg.donut import make_donut
 
-os.environ.setdefault("MUJOCO_GL", "egl")
+
+def opengl_here():
+    """Return a library for OpenGL without a display, by its name in MUJOCO_GL."""
+    for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+        if find_library(library) is not None:
+            return name
+    return "disable"
+
+
+os.environ.setdefault("MUJOCO_GL", opengl_here())
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed")
 
 from v3dg.simulators.mujoco import (  # noqa: E402
