@@ -48,9 +48,11 @@ def camera_of(
     intrinsics.
 
     Args:
-        model, data: `mj_forward` or a step has computed the poses in `data`.
+        model: The model.
+        data: Its state, for which `mj_forward` or a step has computed poses.
         camera: See `CameraName`.
-        width, height: Size of the picture in px.
+        width: Width of the picture in px.
+        height: Height of the picture in px.
 
     Raises:
         ValueError: There is no such camera, its projection is orthographic, or it has a
@@ -130,7 +132,8 @@ def cameras_of(
         model: The model.
         data: One state, or E states of the model, one for each environment of a scene.
         cameras: C cameras; None means all of the model.
-        width, height: Size of the pictures in px.
+        width: Width of the pictures in px.
+        height: Height of the pictures in px.
 
     Returns:
         C cameras, which see everything; or E x C cameras, all of the first environment
@@ -233,7 +236,8 @@ class MeshRenderer:
 
     Args:
         model: The model.
-        width, height: Size of the pictures in px.
+        width: Width of the pictures in px.
+        height: Height of the pictures in px.
         samples: Number of samples of a pixel along each axis.
         option: Which geoms are visible; None means MuJoCo's default, the geom groups 0
             to 2. Put geoms that only collide, because gaussians show the object, into
@@ -352,8 +356,9 @@ class SplatRenderer:
     Args:
         model: The model.
         scene: The scene, in the units and the axes of the model (z up).
-        width, height: Size of the pictures in px.
-        samples, option, labels: As in `MeshRenderer`.
+        width: Width of the pictures in px.
+        height: Height of the pictures in px.
+        samples: As in `MeshRenderer`; so are `option` and `labels`.
         device: As in `v3dg.render`.
 
     Attributes:
