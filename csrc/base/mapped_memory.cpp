@@ -157,7 +157,8 @@ void* MappedMemory::reserve(size_t bytes, cudaStream_t stream) {
 MappedMemory::~MappedMemory() {
     if (first_ == 0) return;
     const KeepsCaptures keeps_captures;
-    // Ignore errors. At exit the driver may be unloaded already, which frees the memory.
+    // Ignore errors. At exit the driver may be unloaded already, which frees the
+    // memory.
     CUdeviceptr piece = first_;
     for (const size_t bytes : piece_bytes_) {
         driver().unmap(piece, bytes);

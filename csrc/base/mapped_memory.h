@@ -2,9 +2,10 @@
 
 // Device memory that grows without moving, for buffers whose size follows a camera.
 //
-// Growing a buffer of a pool means to free it and to allocate a larger one, and it takes
-// as long as drawing several frames. Here a buffer has a range of addresses as large as
-// the memory of the device, and memory is mapped behind the part that is in use.
+// Growing a buffer of a pool means to free it and to allocate a larger one, and it
+// takes as long as drawing several frames. Here a buffer has a range of addresses as
+// large as the memory of the device, and memory is mapped behind the part that is in
+// use.
 
 #include <vector>
 
@@ -13,8 +14,8 @@
 namespace v3dg {
 namespace cuda {
 
-// A range of addresses, the first bytes() of which have memory of the device that was
-// current in the first call of reserve().
+// A range of addresses, the first bytes() of which have memory of the device that
+// was current in the first call of reserve().
 class MappedMemory {
   public:
     MappedMemory() = default;
@@ -46,8 +47,8 @@ class MappedMemory {
     int device_ = 0;
 };
 
-// Like DeviceBuffer, but reserve() does not move an array that is `in_place`. An array
-// that is not in place, as on devices that cannot map memory, is a DeviceBuffer.
+// Like DeviceBuffer, but reserve() does not move an array that is `in_place`. An
+// array that is not in place, as on devices that cannot map memory, is a DeviceBuffer.
 template <class T>
 class GrowingBuffer {
   public:
@@ -59,8 +60,8 @@ class GrowingBuffer {
         if (size * sizeof(T) > mapped_.bytes()) refuse_capture(stream);
         return static_cast<T*>(mapped_.reserve(size * sizeof(T), stream));
     }
-    // Frees the memory. Precondition: the device has finished the work that uses it, if
-    // the array is in place.
+    // Frees the memory. Precondition, if the array is in place: the device has finished
+    // the work that uses it.
     void release() {
         const MappedMemory mapped = std::move(mapped_);
         const DeviceBuffer<T> moving = std::move(moving_);
