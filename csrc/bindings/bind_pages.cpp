@@ -84,7 +84,7 @@ void check_rows(const PageRun& run, PageCodec codec, const Rows& gaussians, cons
     }
 }
 
-PageCodec codec_of(const std::string& name) {
+PageCodec page_codec_of(const std::string& name) {
     return name == "quantized" ? PageCodec::quantized : PageCodec::float32;
 }
 
@@ -115,7 +115,7 @@ void read_run(const py::object& path, int descriptor, const py::object& out,
     const PageRun run = bound.read(hashes);
     if (py::isinstance<py::array>(out))
         return read_words(path, descriptor, run, out.cast<py::array>());
-    read_rows(path, descriptor, run, codec_of(codec), held<Rows>(out, "out"));
+    read_rows(path, descriptor, run, page_codec_of(codec), held<Rows>(out, "out"));
 }
 
 // Writes a range of pages; returns (n, 16) their hashes. `path` is for errors.
@@ -124,10 +124,10 @@ py::object write_run(const py::object& path, int descriptor, const Rows& gaussia
     const auto num_pages = static_cast<py::ssize_t>(bound.places.size() - 1);
     const NewArray<uint8_t> hashes({}, {num_pages, static_cast<py::ssize_t>(kPageHashBytes)});
     const PageRun run = bound.read(hashes.object);
-    check_rows(run, codec_of(codec), gaussians, "gaussians");
+    check_rows(run, page_codec_of(codec), gaussians, "gaussians");
     const GaussianRows<const float> rows = gaussians.read<float>();
     naming_file(path, [&] {
-        write_pages(File::duplicate(descriptor), run, codec_of(codec), rows, hashes.span.data);
+        write_pages(File::duplicate(descriptor), run, page_codec_of(codec), rows, hashes.span.data);
     });
     return hashes.object;
 }
