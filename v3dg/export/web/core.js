@@ -23,7 +23,8 @@ export class Core {
   /** @param {BufferSource} bytes The module, as csrc/wasm/build.py makes it. */
   static async load(bytes) {
     const { instance } = await WebAssembly.instantiate(bytes, { wasi_snapshot_preview1: HOST });
-    instance.exports._initialize?.();
+    const { _initialize: initialize } = instance.exports;
+    initialize?.();
     return new Core(instance.exports);
   }
 
@@ -69,6 +70,33 @@ export class Core {
     const hash = this.read(Uint8Array, this.result, 16);
     this.calls.v3dg_free(message);
     return hash;
+  }
+
+  /**
+   * End by a trap, after which the module must be loaded again, unless tables that a file
+   * contains are valid.
+   * @param {object} tables See bundle_file.js.
+   */
+  checkTables(tables) {
+    const places = [
+      tables.offset,
+      tables.level,
+      tables.ownGroup,
+      tables.parentGroup,
+      tables.box,
+      tables.filter,
+      tables.antialiased,
+      tables.ball,
+      tables.weight,
+      tables.groupParent,
+      tables.groupLevel,
+      tables.groupError,
+    ].map((array) => this.copy(array));
+    const argument = this.copy(
+      Uint32Array.from([tables.weight.length, tables.ownGroup.length, ...places]),
+    );
+    this.calls.v3dg_check_tables(argument);
+    [...places, argument].forEach((place) => this.calls.v3dg_free(place));
   }
 
   /**
