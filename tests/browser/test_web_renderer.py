@@ -33,13 +33,8 @@ MOST_FLIP = 0.006
 @pytest.fixture(scope="module")
 def webgpu():
     """Return Chromium with WebGPU in software."""
-    from playwright.sync_api import sync_playwright
-
-    arguments = [*chromium.ARGUMENTS, *web_pages.ARGUMENTS]
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=arguments)
+    with web_pages.chromium_with_webgpu() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,26 @@
 """Pages that draw given cuts with the renderer for browsers, for tests."""
 
 import base64
+import contextlib
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 
+import chromium
 from v3dg import export
+from v3dg.bundle.format import HASH_BYTES, hash_of_pieces
 
 WEB = Path(export.__file__).parent / "web"
 # WebGPU in software.
-ARGUMENTS = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
+ARGUMENTS = [
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    # Without these, Chromium cannot show what WebGPU draws on a canvas.
+    "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader",
+]
 
 PAGE = """<!doctype html>
 <meta charset="utf-8" />
@@ -76,6 +86,28 @@ window.drawCut = async ({ bundles, instances, cut, camera, background }) => {
 };
 window.isReady = true;
 """
+
+
+@contextlib.contextmanager
+def chromium_with_webgpu():
+    """Start Chromium with WebGPU in software."""
+    from playwright.sync_api import sync_playwright
+
+    arguments = [*chromium.ARGUMENTS, *ARGUMENTS]
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=arguments)
+        yield browser
+        browser.close()
+
+
+def renew_hash(data):
+    """Set the hash of a bundle's header and tables, in the bytes of its file."""
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    start = 8 + size
+    tables = start + header["pages"]["data_offsets"][1]
+    message = bytes(data[:start]) + bytes(data[tables:-HASH_BYTES])
+    data[-HASH_BYTES:] = hash_of_pieces(message)
 
 
 def write_page(folder):

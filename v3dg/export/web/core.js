@@ -20,12 +20,16 @@ const HOST = {
 
 /** A loaded module: its memory, and the calls of core.cpp. */
 export class Core {
-  /** @param {BufferSource} bytes The module, as csrc/wasm/build.py makes it. */
-  static async load(bytes) {
-    const { instance } = await WebAssembly.instantiate(bytes, { wasi_snapshot_preview1: HOST });
-    const { _initialize: initialize } = instance.exports;
+  /**
+   * @param {BufferSource | WebAssembly.Module} code The module, as csrc/wasm/build.py makes
+   *   it, or what it was compiled to.
+   */
+  static async load(code) {
+    const made = await WebAssembly.instantiate(code, { wasi_snapshot_preview1: HOST });
+    const { exports } = made.instance ?? made;
+    const { _initialize: initialize } = exports;
     initialize?.();
-    return new Core(instance.exports);
+    return new Core(exports);
   }
 
   constructor(exports) {
