@@ -153,7 +153,7 @@ def test_a_still_camera_draws_nothing(site, open_tab):
         tab.wait(f"viewer.numFrames > {before}")
 
 
-def test_a_small_budget_and_a_small_pool_bound_what_is_drawn(site, open_tab):
+def test_a_budget_bounds_what_is_drawn(site, open_tab):
     with serving(site) as server:
         tab = open_tab(server.url)
         tab.settle()
@@ -161,6 +161,42 @@ def test_a_small_budget_and_a_small_pool_bound_what_is_drawn(site, open_tab):
         tab.page.evaluate("() => viewer.set({ budget: 2000 })")
         tab.wait("viewer.isSettled")
         assert tab.num_gaussians <= 2000 < before
+
+
+OPEN_WITH_A_SMALL_POOL = """async () => {
+  const { open } = await import("./viewer/viewer.js");
+  const { camera } = viewer;
+  viewer.close();
+  const canvas = document.createElement("canvas");
+  window.viewer = await open(canvas, "scene.json", { poolBytes: 40_000 });
+  window.viewer.setCamera(camera);
+}"""
+
+
+def test_a_small_pool_holds_a_coarser_picture(scene, site, open_tab):
+    _, count = expected_picture(scene)
+    with serving(site) as server:
+        tab = open_tab(server.url)
+        tab.settle()
+        whole = tab.page.evaluate("() => viewer.memoryBytes")
+        tab.page.evaluate(OPEN_WITH_A_SMALL_POOL)
+        tab.settle()
+        assert tab.num_gaussians < count
+        assert tab.page.evaluate("() => viewer.memoryBytes") < whole - 2**26
+        assert tab.picture().max() > 0.3
+        assert tab.errors == []
+
+
+def test_a_lost_device_is_replaced(scene, site, open_tab):
+    expected, count = expected_picture(scene)
+    with serving(site) as server:
+        tab = open_tab(server.url)
+        tab.settle()
+        tab.page.evaluate("() => { viewer.renderer.device.destroy(); }")
+        tab.wait("window.notices.includes('WebGPU: the device was lost; starting it again')")
+        tab.settle()
+        assert tab.num_gaussians == count
+        assert psnr(np.clip(tab.picture(), 0, 1), np.clip(expected, 0, 1)) >= LEAST_PSNR
 
 
 def test_a_server_without_ranges_sends_whole_files(scene, site, open_tab):

@@ -270,8 +270,15 @@ class Page {
   }
 }
 
+/** Return the settings in the page's address; what is no positive number is ignored. */
+function settingsOfAddress() {
+  const query = new URLSearchParams(location.search);
+  const names = ["budget", "tolerance"].filter((name) => Number(query.get(name)) > 0);
+  return Object.fromEntries(names.map((name) => [name, Number(query.get(name))]));
+}
+
 try {
-  const viewer = await open(canvas, SCENE);
+  const viewer = await open(canvas, SCENE, settingsOfAddress());
   window.viewer = viewer;
   window.page = new Page(viewer);
 } catch (error) {

@@ -34,8 +34,7 @@ export class NoDevice extends Error {}
 /**
  * A scene on a canvas.
  *
- * Events: `opened`, `firstpicture`, `settled`, `progress` (detail: missing pages, and the
- * tolerance), `notice` (detail: text, empty when the state is over), `failure` (detail: text).
+ * Events: `opened`, `firstpicture`, `settled`, `progress` (detail: missing pages), `notice` (detail: text, empty when the state is over), `failure` (detail: text).
  */
 export class Viewer extends EventTarget {
   readonly cameras: NamedCamera[];
@@ -43,6 +42,8 @@ export class Viewer extends EventTarget {
   /** Centre and radius of the scene; null until it is open. */
   readonly ball: number[] | null;
   readonly numGaussians: number;
+  /** Of the cut that is drawn. A budget raises it. */
+  readonly tolerance: number;
   readonly numFrames: number;
   readonly receivedBytes: number;
   readonly memoryBytes: number;

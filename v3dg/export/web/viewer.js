@@ -31,6 +31,8 @@ export class Viewer extends EventTarget {
   ball = null;
   /** Gaussians of the cut that is drawn. */
   numGaussians = 0;
+  /** Tolerance of that cut, which a budget raises, px² a gaussian. */
+  tolerance = 0;
   /** Bytes that were received. */
   receivedBytes = 0;
   /** Whether nothing changes while the camera is still. */
@@ -87,6 +89,7 @@ export class Viewer extends EventTarget {
     if (this.isClosed) return;
     this.emit("notice", { text: "WebGPU: the device was lost; starting it again" });
     this.hasPicture = false;
+    this.isSettled = false;
     try {
       await this.startRenderer();
     } catch (error) {
@@ -129,10 +132,17 @@ export class Viewer extends EventTarget {
 
   /** @param {any} message */
   receiveCut({ cut, isSettled, missing, receivedBytes, tolerance }) {
+    const most = this.renderer.mostGaussians;
+    if (cut.count > most) {
+      const problem = `the coarsest picture has ${cut.count} gaussians`;
+      this.emit("notice", { text: `scene: ${problem}, and this device can draw ${most}` });
+      return;
+    }
     this.renderer.setCut(cut);
     this.numGaussians = cut.count;
+    this.tolerance = tolerance;
     this.receivedBytes = receivedBytes;
-    this.emit("progress", { missing, tolerance });
+    this.emit("progress", { missing });
     this.invalidate();
     const hasSettled = isSettled && !this.isSettled;
     this.isSettled = isSettled;
