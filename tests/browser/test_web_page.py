@@ -153,6 +153,23 @@ def test_a_still_camera_draws_nothing(site, open_tab):
         tab.wait(f"viewer.numFrames > {before}")
 
 
+def test_a_camera_of_the_file_orbits_around_the_scene(site, open_tab):
+    camera = CAMERAS["<b>front</b>"]
+    with serving(site) as server:
+        tab = open_tab(server.url)
+        tab.settle()
+        ball = tab.page.evaluate("() => viewer.ball")
+        away = np.linalg.norm(camera.position - ball[:3])
+        assert tab.page.evaluate("() => page.camera.distance") == pytest.approx(away)
+        tab.page.mouse.move(100, 60)
+        tab.page.mouse.down()
+        tab.page.mouse.move(130, 70, steps=3)
+        tab.page.mouse.up()
+        assert tab.page.evaluate("() => page.camera.distance") == pytest.approx(away)
+        moved = tab.page.evaluate("() => page.camera.position")
+        assert np.linalg.norm(camera.position - moved) > 0.1 * away
+
+
 def test_a_budget_bounds_what_is_drawn(site, open_tab):
     with serving(site) as server:
         tab = open_tab(server.url)

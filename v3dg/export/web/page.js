@@ -126,6 +126,8 @@ class Page {
       -1,
     );
     this.near = near;
+    // put() moves the focus ahead of the camera, at this distance.
+    this.camera.position = position;
     this.camera.focus = this.viewer.ball.slice(0, 3);
     // All of the view is visible in windows of any shape.
     const slopeX = (width / (2 * k[0])) * (canvas.clientHeight / canvas.clientWidth);

@@ -8,6 +8,7 @@
 // (instances, cameras, up, balls), page (place, bytes), cut (cut, tolerance, isSettled,
 // missing, receivedBytes), notice (text), failure (text).
 
+import { rotationOf } from "./placement.js";
 import { NoDevice, Renderer } from "./renderer.js";
 
 /** @typedef {import("./placement.js").Instances} Instances */
@@ -223,16 +224,19 @@ function ballAround(instances, balls) {
   const low = [Infinity, Infinity, Infinity];
   const high = [-Infinity, -Infinity, -Infinity];
   instances.bundle.forEach((bundle, i) => {
-    // The ball of a rotated instance is bounded without its rotation.
     const [x, y, z, radius] = balls[bundle];
-    const reach = instances.scales[i] * (radius + Math.hypot(x, y, z));
+    const [qw, qx, qy, qz] = instances.quaternions.subarray(4 * i, 4 * i + 4);
+    const rotation = rotationOf(qw, qx, qy, qz);
+    const scale = instances.scales[i];
     for (let a = 0; a < 3; a += 1) {
-      low[a] = Math.min(low[a], instances.positions[3 * i + a] - reach);
-      high[a] = Math.max(high[a], instances.positions[3 * i + a] + reach);
+      const [rx, ry, rz] = rotation.slice(3 * a, 3 * a + 3);
+      const center = scale * (rx * x + ry * y + rz * z) + instances.positions[3 * i + a];
+      low[a] = Math.min(low[a], center - scale * radius);
+      high[a] = Math.max(high[a], center + scale * radius);
     }
   });
-  const center = low.map((value, a) => (value + high[a]) / 2);
-  return [...center, Math.hypot(...low.map((value, a) => high[a] - value)) / 2];
+  const middle = low.map((value, a) => (value + high[a]) / 2);
+  return [...middle, Math.hypot(...low.map((value, a) => high[a] - value)) / 2];
 }
 
 /**
