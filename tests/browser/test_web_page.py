@@ -12,7 +12,6 @@ import chromium
 import scenes_lod
 import v3dg
 import web_pages
-from v3dg.export import web_page
 from v3dg.metrics import psnr
 from web_server import serving
 
@@ -323,9 +322,3 @@ def test_a_scene_may_not_name_files_of_other_servers(site, open_tab):
         tab.wait("window.notices.length > 0")
         expected = "scene.json: bundles.bundle_0: expected a file of this server"
         assert tab.notices == [expected]
-
-
-def test_an_installation_without_the_core_says_so(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(web_page, "_CORE", "missing.wasm")
-    with pytest.raises(RuntimeError, match="web page: this installation has no core"):
-        v3dg.write_web_page(scene, tmp_path / "site")
