@@ -225,13 +225,11 @@ void v3dg_select(WebScene* scene, const ViewValues* view, CutValues* out) {
             .weight = cut.weight.empty() ? nullptr : cut.weight.data()};
 }
 
-// Decodes the gaussians of a coded page. `offset` has the first row of each cluster and
-// the end. Returns the number of clusters, or the index of the first cluster whose
-// ranges are invalid; then nothing is decoded.
-V3DG_EXPORT(v3dg_decode_page)
-uint32_t v3dg_decode_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
-                          int32_t sh_degree, float* means, float* quats, float* scales,
-                          float* opacities, float* sh) {
+// Returns the number of clusters of a coded page, or the index of the first cluster whose
+// ranges are invalid. `offset` is as for v3dg_decode_page().
+V3DG_EXPORT(v3dg_check_page)
+uint32_t v3dg_check_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
+                         int32_t sh_degree) {
     const PageCodes<const uint32_t> page{{offset, num_clusters + size_t(1)}, words, sh_degree};
     for (uint32_t c = 0; c < num_clusters; ++c) {
         const uint32_t* ranges = page.ranges(c);
@@ -240,6 +238,19 @@ uint32_t v3dg_decode_page(const int64_t* offset, uint32_t num_clusters, const ui
                        sh_degree))
             return c;
     }
+    return num_clusters;
+}
+
+// Decodes the gaussians of a coded page. `offset` has the first row of each cluster and
+// the end. Returns the number of clusters, or the index of the first cluster whose
+// ranges are invalid; then nothing is decoded.
+V3DG_EXPORT(v3dg_decode_page)
+uint32_t v3dg_decode_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
+                          int32_t sh_degree, float* means, float* quats, float* scales,
+                          float* opacities, float* sh) {
+    const uint32_t num_valid = v3dg_check_page(offset, num_clusters, words, sh_degree);
+    if (num_valid < num_clusters) return num_valid;
+    const PageCodes<const uint32_t> page{{offset, num_clusters + size_t(1)}, words, sh_degree};
     cpu::decode_page(page, {.means = means,
                             .quats = quats,
                             .scales = scales,

@@ -296,6 +296,33 @@ def test_tables_that_contradict_each_other_are_refused(site, open_tab):
         assert "its tables contradict each other" in tab.notices[0]
 
 
+def test_pages_that_are_not_finite_are_refused(site, open_tab):
+    path = min(site.glob("*.v3dg"))
+    data = bytearray(path.read_bytes())
+    web_pages.spoil_page(data, 0)
+    path.write_bytes(data)
+    with serving(site) as server:
+        tab = open_tab(server.url)
+        tab.wait("window.viewer?.renderer?.cut")
+        tab.page.evaluate("() => viewer.set({ tolerance: 0.001 })")
+        tab.wait("window.notices.length > 0")
+        assert tab.notices[0].endswith("a page has invalid ranges; write the file again")
+        tab.settle()
+        assert np.isfinite(tab.picture()).all()
+
+
+def test_a_bundle_whose_coarsest_page_is_not_finite_is_left_out(site, open_tab):
+    path = min(site.glob("*.v3dg"))
+    data = bytearray(path.read_bytes())
+    web_pages.spoil_page(data, -1)
+    path.write_bytes(data)
+    with serving(site) as server:
+        tab = open_tab(server.url)
+        tab.settle()
+        assert tab.notices == [f"{path.name}: a page has invalid ranges; write the file again"]
+        assert tab.num_gaussians > 0
+
+
 def test_names_are_no_markup_and_the_policy_allows_only_the_server(site, open_tab):
     with serving(site) as server:
         tab = open_tab(server.url)

@@ -2,6 +2,7 @@
 
 import base64
 import contextlib
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -108,6 +109,27 @@ def renew_hash(data):
     tables = start + header["pages"]["data_offsets"][1]
     message = bytes(data[:start]) + bytes(data[tables:-HASH_BYTES])
     data[-HASH_BYTES:] = hash_of_pieces(message)
+
+
+def spoil_page(data, page):
+    """Make the ranges of a page infinite, with correct hashes, in the bytes of a
+    bundle's file."""
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    start = 8 + size
+
+    def table(name, dtype):
+        first, end = (start + place for place in header[name]["data_offsets"])
+        return np.frombuffer(memoryview(data)[first:end], dtype)
+
+    starts = [*table("pages.offset", np.int64), header["pages"]["shape"][0]]
+    page %= len(starts) - 1
+    first, end = starts[page : page + 2]
+    words = np.frombuffer(memoryview(data)[start + first : start + end], np.uint32)
+    words[-12:] = 0x7F800000
+    digest = hashlib.blake2b(words.tobytes(), digest_size=HASH_BYTES).digest()
+    table("pages.hash", np.uint8)[HASH_BYTES * page :][:HASH_BYTES] = list(digest)
+    renew_hash(data)
 
 
 def write_page(folder):

@@ -101,6 +101,8 @@ export class BundleFile {
     this.tables = null;
     /** Gaussians before each cluster, C + 1. @type {Float64Array} */
     this.rows = null;
+    /** The coarsest page. @type {Uint8Array} */
+    this.root = null;
     /** First byte of each page, from `dataStart`, and the end, P + 1. @type {Float64Array} */
     this.pageStart = null;
   }
@@ -232,7 +234,19 @@ export class BundleFile {
   }
 
   /**
-   * Throw Problem unless the bytes of a page match its hash.
+   * Read the coarsest page.
+   *
+   * @param {Core} core
+   */
+  async readRoot(core) {
+    const page = this.numPages - 1;
+    const [bytes] = await this.readPages(page, page + 1);
+    this.verify(core, page, bytes);
+    this.root = bytes;
+  }
+
+  /**
+   * Throw Problem unless the bytes of a page match its hash and are valid.
    *
    * @param {Core} core
    * @param {number} page
@@ -242,6 +256,11 @@ export class BundleFile {
     const expected = this.tables.pageHash.subarray(HASH_BYTES * page, HASH_BYTES * (page + 1));
     if (!core.hash(bytes).every((byte, k) => byte === expected[k])) {
       throw this.problem("a page does not match its hash: the file has changed; reload the page");
+    }
+    const { offset, firstCluster } = this.tables;
+    const rows = offset.subarray(firstCluster[page], this.endCluster(page) + 1);
+    if (!core.isValidPage(rows, bytes, this.degree)) {
+      throw this.problem("a page has invalid ranges; write the file again");
     }
   }
 }

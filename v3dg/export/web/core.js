@@ -104,6 +104,21 @@ export class Core {
   }
 
   /**
+   * Whether all gaussians of a coded page are finite.
+   * @param {BigInt64Array} offset First row of each cluster, and the end.
+   * @param {Uint8Array} bytes The page.
+   * @param {number} degree Degree of the spherical harmonics.
+   */
+  isValidPage(offset, bytes, degree) {
+    const relative = BigInt64Array.from(offset, (row) => row - offset[0]);
+    const places = [this.copy(relative), this.copy(bytes)];
+    const clusters = offset.length - 1;
+    const valid = this.calls.v3dg_check_page(places[0], clusters, places[1], degree);
+    places.forEach((place) => this.calls.v3dg_free(place));
+    return valid === clusters;
+  }
+
+  /**
    * Decode a coded page to its rows.
    * @param {BigInt64Array} offset First row of each cluster, and the end.
    * @param {Uint8Array} bytes The page.

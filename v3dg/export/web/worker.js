@@ -73,30 +73,16 @@ class World {
     });
     this.scene = new Scene(core, this.bundles);
     this.scene.setInstances(instances);
-    /** @type {Uint8Array[]} */
-    this.roots = [];
   }
 
   get receivedBytes() {
     return this.files.reduce((sum, { source }) => sum + source.receivedBytes, 0);
   }
 
-  /** Read the coarsest page of each bundle. */
-  async readRoots() {
-    this.roots = await Promise.all(
-      this.files.map(async (file) => {
-        const root = file.numPages - 1;
-        const [bytes] = await retrying(() => file.readPages(root, root + 1));
-        file.verify(this.core, root, bytes);
-        return bytes;
-      }),
-    );
-    this.putRoots();
-  }
-
+  /** Make the coarsest page of each bundle resident. */
   putRoots() {
-    this.roots.forEach((bytes, bundle) => {
-      postMessage({ type: "page", place: this.pool.putRoot(bundle), bytes });
+    this.files.forEach(({ root }, bundle) => {
+      postMessage({ type: "page", place: this.pool.putRoot(bundle), bytes: root });
     });
   }
 
@@ -289,13 +275,17 @@ function report(error) {
  *
  * @param {string[]} urls
  * @param {Instances} instances
- * @param {() => Promise<Core>} newCore
+ * @param {WebAssembly.Module} module The core.
  */
-async function openFiles(urls, instances, newCore) {
+async function openFiles(urls, instances, module) {
+  const core = await Core.load(module);
   const opened = await Promise.all(
     urls.map(async (url) => {
       try {
-        return await retrying(() => BundleFile.open(new Source(url), newCore));
+        const source = new Source(url);
+        const file = await retrying(() => BundleFile.open(source, () => Core.load(module)));
+        await retrying(() => file.readRoot(core));
+        return file;
       } catch (error) {
         if (!(error instanceof Problem)) throw error;
         report(error);
@@ -340,13 +330,12 @@ async function openWorld(url, poolBytes) {
   if (!response.ok) throw new Problem(`core.wasm: the server answered ${response.status}`);
   const module = await WebAssembly.compile(await response.arrayBuffer());
   const { urls, instances: all, cameras, up } = await readScene(url);
-  const { files, instances } = await openFiles(urls, all, () => Core.load(module));
+  const { files, instances } = await openFiles(urls, all, module);
   if (files.length === 0) return;
   world = new World(await Core.load(module), files, instances, poolBytes);
   const balls = files.map(({ tables }) => tables.ball.slice(-4));
   postMessage({ type: "opened", instances, cameras, up, balls });
-  await world.readRoots();
-  world.schedule(0);
+  world.putRoots();
 }
 
 /** @type {Request} */
@@ -359,7 +348,7 @@ addEventListener("message", async ({ data }) => {
       if (world !== null && lastRequest !== null) world.look(lastRequest);
     } else if (data.type === "look") {
       lastRequest = data.request;
-      if (world !== null && world.roots.length > 0) world.look(data.request);
+      world?.look(data.request);
     } else if (data.type === "reset") {
       world?.reset();
     }
