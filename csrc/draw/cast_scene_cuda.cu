@@ -292,11 +292,5 @@ void RayFrame::release_buffers() {
     sorted_ = {};
 }
 
-size_t RayFrame::bytes() const {
-    return rows_.bytes() + coded_.bytes() + cut_.bytes() + grid_.bytes() + cameras_.bytes() +
-           images_.bytes() + placements_.bytes() + factors_.bytes() + counters_.bytes() +
-           items_.bytes() + records_.bytes() + entries_.bytes() + sorted_.bytes();
-}
-
 }  // namespace cuda
 }  // namespace v3dg

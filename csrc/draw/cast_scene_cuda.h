@@ -24,7 +24,6 @@ class DeviceRayGrid {
   public:
     // Copies the directions, unless they are there already.
     const RayDirections& load(const std::shared_ptr<const RayGrid>& grid, cudaStream_t stream);
-    size_t bytes() const { return floats_.bytes() + ints_.bytes(); }
 
   private:
     std::shared_ptr<const RayGrid> grid_;
@@ -55,9 +54,6 @@ class RayFrame {
                                     const Appearance<float>& appearance, const RaySensor& sensor,
                                     const RayPoses& poses, const RayPlanes& planes,
                                     cudaStream_t stream);
-
-    // Returns the device memory in bytes, without the models.
-    size_t bytes() const;
 
   private:
     struct Subject;

@@ -71,8 +71,6 @@ struct RaySortBuffers {
     DeviceBuffer<uint64_t> sorted;
     DeviceBuffer<unsigned char> scratch;
     DeviceBuffer<uint32_t> first;  // [tiles + 1] first entry of each tile
-
-    size_t bytes() const { return sorted.bytes() + scratch.bytes() + first.bytes(); }
 };
 
 // Sorts entries, and finds the first one of each tile.
