@@ -206,7 +206,7 @@ from scenes_lod import blob, lod_bundle, random_scene
 rng = np.random.default_rng(9)
 scene = random_scene(rng, lod_bundle(rng, blob(rng, 400), 16), 12, spread=3)
 lidar = v3dg.Lidar(np.linspace(0, 6, 50), np.linspace(-1, 1, 20))
-scan = v3dg.scan(scene, lidar, np.eye(4))
+scan = v3dg.scan(scene, lidar, np.eye(4), device="cpu")
 sys.stdout.buffer.write(scan.range.tobytes() + scan.alpha.tobytes())
 """
 
