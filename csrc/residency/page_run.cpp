@@ -1,5 +1,6 @@
-// Reads, verifies and decodes adjacent pages of a file; encodes, hashes and writes them.
-// A thread works on several pages at once, because they are hashed in parallel lanes.
+// Reads, verifies and decodes adjacent pages of a file; encodes, hashes and writes
+// them. A thread works on several pages at once, because they are hashed in parallel
+// lanes.
 
 #include "residency/page_run.h"
 
