@@ -1,3 +1,7 @@
+// Reads, verifies and decodes adjacent pages of a file; encodes, hashes and writes
+// them. A thread works on several pages at once, because they are hashed in parallel
+// lanes.
+
 #include "residency/page_run.h"
 
 #include <algorithm>
