@@ -61,6 +61,8 @@ class Config:
     bundle: Path | None = None
     """Levels of that asset, a .v3dg file; by default the asset is built as a draft."""
     gsplat: bool = True
+    errors: bool = True
+    """Whether pictures are compared with all gaussians, which takes most of a run."""
     output: str | None = None
 
 
@@ -93,6 +95,11 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
     runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
     moving = movement(scene, cameras[-1], config)
     flown = [flight(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
+    about: Row = {"instances": len(scene), "cameras": config.cameras}
+    if not config.errors:
+        frame_rows = [row for row, _ in runs]
+        print(*frame_rows, moving, *flown, sep="\n", flush=True)
+        return {**about, "frames": frame_rows, "moving": moving, "flights": flown}
     for (row, _), gigabytes in zip(
         runs[:-1], gigabytes_alone(scene.bundles[0], config), strict=True
     ):
@@ -118,7 +125,6 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
             flush=True,
         )
         rows.append(row)
-    about: Row = {"instances": len(scene), "cameras": config.cameras}
     result: Row = {**about, "frames": rows, "moving": moving, "flights": flown}
     if peer_ms:
         errors = judge.errors(zip(truths, peer_pictures, strict=True))
@@ -288,7 +294,20 @@ def field(bundle: v3dg.Bundle, count: int, config: Config, judge: Judge) -> Row:
     if budget > v3dg.select(scene, camera, tolerance=math.inf, device=gpu.DEVICE).num_gaussians:
         limited, _ = frames(scene, [camera], {"budget": budget}, config.repeats)
         row["with_budget"] = {key: limited[key] for key in ("budget", "frame_ms", "select_ms")}
-    pairs, full = [], []
+    row |= {"instances": count, "gaussians": count * len(means)}
+    if config.errors:
+        row |= errors_of_crops(scene, camera, config, judge, rng)
+    row = {key: value for key, value in row.items() if not key.endswith("of_each")}
+    print(row, flush=True)
+    return row
+
+
+def errors_of_crops(
+    scene: Scene, camera: Camera, config: Config, judge: Judge, rng: np.random.Generator
+) -> Row:
+    """Return the mean errors of crops of a picture, with levels and in full."""
+    pairs: list[tuple[Picture, Picture]] = []
+    full: list[tuple[Picture, Picture]] = []
     for _ in range(config.crops):
         x, y = rng.integers((400, 500), (1456, 800))
         K = camera.K - [[0, 0, x], [0, 0, y], [0, 0, 0]]
@@ -297,14 +316,8 @@ def field(bundle: v3dg.Bundle, count: int, config: Config, judge: Judge) -> Row:
         for kind, tolerance in ((pairs, DEFAULT_TOLERANCE), (full, 0.0)):
             color = v3dg.render(scene, crop, tolerance=tolerance, device=gpu.DEVICE).color
             kind.append((truth, to_8bit(color)))
-    row |= {
-        "instances": count,
-        "gaussians": count * len(means),
-        **mean_of(judge.errors(pairs), "flip", "psnr"),
-    }
+    row: Row = dict(mean_of(judge.errors(pairs), "flip", "psnr"))
     row["full"] = mean_of(judge.errors(full), "flip", "psnr")
-    row = {key: value for key, value in row.items() if not key.endswith("of_each")}
-    print(row, flush=True)
     return row
 
 

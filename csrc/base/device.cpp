@@ -7,6 +7,8 @@
 #include <utility>
 #include <vector>
 
+#include "base/out_of_memory.h"
+
 namespace v3dg {
 namespace cuda {
 
@@ -108,6 +110,14 @@ static cudaMemPool_t pool_of_current_device() {
 
 static std::string mebibytes(size_t bytes) { return std::to_string((bytes >> 20) + 1) + " MiB"; }
 
+void fail_out_of_memory(size_t requested_bytes) {
+    cudaGetLastError();
+    size_t free_bytes = 0, total = 0;
+    check(cudaMemGetInfo(&free_bytes, &total), "cudaMemGetInfo");
+    throw OutOfMemory("cuda: out of memory: requested " + mebibytes(requested_bytes) +
+                      ", free: " + mebibytes(free_bytes) + " of " + mebibytes(total));
+}
+
 void* allocate(size_t bytes, cudaStream_t stream) {
     if (bytes == 0) return nullptr;
     const cudaMemPool_t pool = pool_of_current_device();
@@ -121,13 +131,7 @@ void* allocate(size_t bytes, cudaStream_t stream) {
         check(cudaMemPoolTrimTo(pool, 0), "cudaMemPoolTrimTo");
         error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
     }
-    if (error == cudaErrorMemoryAllocation) {
-        cudaGetLastError();
-        size_t free_bytes = 0, total = 0;
-        check(cudaMemGetInfo(&free_bytes, &total), "cudaMemGetInfo");
-        throw OutOfMemory("cuda: out of memory: requested " + mebibytes(bytes) +
-                          ", free: " + mebibytes(free_bytes) + " of " + mebibytes(total));
-    }
+    if (error == cudaErrorMemoryAllocation) fail_out_of_memory(bytes);
     check(error, "cudaMallocFromPoolAsync");
     return pointer;
 }

@@ -9,6 +9,7 @@
 #include <string>
 
 #include "project/project_backward.h"
+#include "rasterize/sense_math.h"
 
 namespace v3dg {
 namespace cuda {
@@ -54,17 +55,38 @@ constexpr size_t kEllipseFloats = 8,
 // frames are in flight or captured.
 constexpr size_t kSlots = 8;
 
-Frame::Frame(Keeps keeps) : keeps_(keeps) {
+Frame::Frame(Keeps keeps)
+    : keeps_(keeps),
+      grows_in_place_(keeps == Keeps::nothing && MappedMemory::is_supported()),
+      records_(grows_in_place_),
+      large_(grows_in_place_),
+      entries_(grows_in_place_),
+      scratch_(grows_in_place_) {
     for (size_t i = 0; i < kSlots; ++i) slots_.push_back(std::make_unique<Slot>());
     for (const auto& slot : slots_) free_slots_.push_back(slot.get());
 }
 
-Frame::~Frame() = default;
+Frame::~Frame() { wait_before_unmapping(); }
+
+void Frame::wait_before_unmapping() const {
+    if (!grows_in_place_) return;
+    const KeepsCaptures keeps_captures;
+    busy_.wait();
+}
 
 template <class T>
 T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
     if (size > buffer.capacity() && was_captured_ && !drawing.is_captured_)
         retired_.push_back(std::make_shared<DeviceBuffer<T>>(std::move(buffer)));
+    return buffer.reserve(size, drawing.stream_);
+}
+
+template <class T>
+T* Frame::room(GrowingBuffer<T>& buffer, size_t size, const Drawing& drawing) {
+    const bool moves = size > buffer.capacity() && !buffer.is_in_place();
+    if (moves && was_captured_ && !drawing.is_captured_)
+        retired_.push_back(
+            std::make_shared<GrowingBuffer<T>>(std::exchange(buffer, GrowingBuffer<T>())));
     return buffer.reserve(size, drawing.stream_);
 }
 
@@ -91,10 +113,10 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Growing a buffer takes as long as drawing several frames, and a frame that
-    // exceeds a buffer is drawn twice. So buffers grow before a moving camera exceeds
-    // them. All buffers that are nearly full grow together, by more than the counts
-    // require.
+    // Growing a buffer that moves takes as long as drawing several frames, and a frame
+    // that exceeds a buffer is drawn twice. So buffers grow before a moving camera
+    // exceeds them. All buffers that are nearly full grow together, by more than the
+    // counts require; by less if they grow in place.
     const auto is_full = [](unsigned long long capacity, unsigned long long count,
                             unsigned free_part) { return count > capacity - capacity / free_part; };
     const bool grows = is_full(capacity_.items, counters.items, 32) ||
@@ -104,8 +126,9 @@ void Frame::enlarge(const FrameCounters& counters) {
                        is_full(capacity_.spread, counters.spread, 32);
     if (!grows) return;
     const Capacity before = capacity_;
-    const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
-        if (is_full(capacity, count, 8)) capacity = std::max(capacity, count + count / 8);
+    const unsigned part = grows_in_place_ ? 16 : 8;
+    const auto grow = [is_full, part](unsigned long long& capacity, unsigned long long count) {
+        if (is_full(capacity, count, part)) capacity = std::max(capacity, count + count / part);
     };
     // If the gaussians exceed their capacity, no entries were counted, so estimate
     // their number: most scenes have one or two entries per gaussian.
@@ -121,14 +144,21 @@ void Frame::enlarge(const FrameCounters& counters) {
     // With a tape, the caller receives the counts before lists are spread. So the
     // buffer must have room for all entries.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
-    if (was_captured_ || capacity_ == before) return;
+    if (was_captured_ || grows_in_place_ || capacity_ == before) return;
     // Free the largest buffers before allocating larger ones, and return their memory
     // to the device, because the memory pool cannot reuse the smaller blocks.
-    records_ = {};
-    boxes_ = {};
-    entries_ = {};
-    scratch_ = {};
+    release_large_buffers();
     trim_pool(last_stream_);
+}
+
+void Frame::release_large_buffers() {
+    wait_before_unmapping();
+    records_.release();
+    normals_ = {};
+    boxes_ = {};
+    large_.release();
+    entries_.release();
+    scratch_.release();
 }
 
 void Frame::release_buffers() {
@@ -137,11 +167,11 @@ void Frame::release_buffers() {
     items_ = {};
     item_records_ = {};
     item_tiles_ = {};
-    records_ = {};
-    boxes_ = {};
-    large_ = {};
-    entries_ = {};
-    scratch_ = {};
+    normals_ = {};
+    instances_ = {};
+    source_ = {};
+    order_ = {};
+    release_large_buffers();
     trim_pool(last_stream_);
 }
 
@@ -207,8 +237,10 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     // lists of small records are no longer needed.
     FewTiles* few = room(scratch_, capacity.spread, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
-    uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
-    if (keeps_tape) room(boxes_, capacity.records, drawing);
+    const FrameSensors& sensors = batch.sensors;
+    const bool needs_source = keeps_tape || sensors.needs_normals() || sensors.needs_instances();
+    uint32_t* source = needs_source ? room(source_, capacity.records, drawing) : nullptr;
+    if (needs_source) room(boxes_, capacity.records, drawing);
     const RecordPlanes planes = records();
     const TileBinOutput bins{.tile_first = room(tile_first_, batch.num_tiles + 1, drawing),
                              .image_of_tile = room(image_of_tile_, batch.num_tiles, drawing),
@@ -253,10 +285,11 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
               .counts = tiles,
               .counters = &state->counters},
              bins, stream);
-    num_plans_ = keeps_tape ? batch.num_tiles : most_plans(batch.num_tiles);
+    const bool needs_order = keeps_tape || sensors.is_on();
+    num_plans_ = needs_order ? batch.num_tiles : most_plans(batch.num_tiles);
     room(plans_, num_plans_, drawing);
-    const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
-                          keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
+    const RasterTape tape{needs_order ? room(order_, capacity.entries, drawing) : nullptr,
+                          needs_order ? room(blended_, batch.num_tiles, drawing) : nullptr};
     FrameLists of_frame = lists(batch);
     // With a tape, the counts are copied before blending, so that the caller need not
     // wait for the pictures. Without a tape, the blend kernel writes them to host
@@ -278,7 +311,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
         of_frame.planes[k] = drawing.planes_[k];
         of_frame.has_depth = of_frame.has_depth || drawing.planes_[k].depth != nullptr;
     }
-    rasterize(of_frame, keeps_tape ? &tape : nullptr, stream);
+    rasterize(of_frame, needs_order ? &tape : nullptr, stream);
+    if (sensors.is_on()) sense(drawing, of_frame, tape, items, source);
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
@@ -288,6 +322,41 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (was_captured_ || keeps_tape) return;
     check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
     num_zero_bytes_ = num_zero_bytes;
+}
+
+void Frame::sense(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+                  const ItemList& items, const uint32_t* source) {
+    const SceneTables* scene = drawing.batch_.sensed_scene.scene;
+    if (scene == nullptr) {
+        sense_scene(drawing, lists, tape, items, source, SceneOnDevice{});
+        return;
+    }
+    const StreamLock lock = scene->lock(drawing.stream_);
+    sense_scene(drawing, lists, tape, items, source, scene->on_device());
+}
+
+void Frame::sense_scene(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+                        const ItemList& items, const uint32_t* source, const SceneOnDevice& scene) {
+    const FrameBatch& batch = drawing.batch_;
+    const FrameSensors& sensors = batch.sensors;
+    const size_t num_records = drawing.capacity_.records;
+    float* normals = sensors.needs_normals() ? room(normals_, 3 * num_records, drawing) : nullptr;
+    int32_t* instances =
+        sensors.needs_instances() ? room(instances_, num_records, drawing) : nullptr;
+    if (source != nullptr)
+        find_sensed_records({.items = items,
+                             .item_records = item_records_.data(),
+                             .source = source,
+                             .placements = batch.placements,
+                             .models = batch.models,
+                             .packed = batch.packed,
+                             .coded = batch.coded,
+                             .scene = batch.sensed_scene,
+                             .environments = scene.environments},
+                            normals, instances, drawing.stream_);
+    const int32_t* labels = scene.label.empty() ? nullptr : scene.label.data;
+    cuda::sense(lists, tape, {.normal = normals, .instance = instances, .label = labels}, sensors,
+                drawing.stream_);
 }
 
 FrameLists Frame::lists(const FrameBatch& batch) const {
@@ -318,7 +387,8 @@ std::vector<std::pair<const char*, size_t>> Frame::bytes() const {
         {"items", items_.bytes() + item_records_.bytes() + item_tiles_.bytes()},
         {"large", large_.bytes()},
         {"tiles", tile_first_.bytes() + image_of_tile_.bytes() + plans_.bytes() + cleared_.bytes()},
-        {"tape", tape}};
+        {"tape", tape},
+        {"channels", normals_.bytes() + instances_.bytes()}};
 }
 
 RecordPlanes Frame::records() const {

@@ -9,6 +9,8 @@
 #include <vector>
 
 #include "base/device.h"
+#include "base/mapped_memory.h"
+#include "draw/sensed_records.h"
 #include "frame/tile_list.h"
 #include "project/project_cuda.h"
 #include "rasterize/rasterize.h"
@@ -48,6 +50,9 @@ struct FrameBatch {
     // Whether images become NaN if they are not drawn because a buffer is too small.
     // All of them have planes.
     bool marks_undrawn = false;
+    // Channels and meshes of the images; and the scene that the channels show.
+    FrameSensors sensors = {};
+    SensedScene sensed_scene = {};
 };
 
 // The results of a frame that its backward pass needs. Valid until the next frame is
@@ -116,6 +121,12 @@ class Frame {
     struct Slot;
     struct State;
     void enqueue(Drawing& drawing, const Place& place);
+    // Enqueues the sensor pass. `source` is as in ProjectOutput; it may be null if no
+    // channel needs it.
+    void sense(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+               const ItemList& items, const uint32_t* source);
+    void sense_scene(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+                     const ItemList& items, const uint32_t* source, const SceneOnDevice& scene);
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
@@ -127,18 +138,31 @@ class Frame {
     Slot* take_slot(bool capturing);
     template <class T>
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
+    template <class T>
+    T* room(GrowingBuffer<T>& buffer, size_t size, const Drawing& drawing);
+    // Frees the large buffers.
+    void release_large_buffers();
+    // Waits for the device if it may use memory that is unmapped when it is freed.
+    void wait_before_unmapping() const;
 
     const Keeps keeps_;
+    // Whether the large buffers grow in place. With a tape they do not, because other
+    // streams may read a tape when its frame is destroyed.
+    const bool grows_in_place_;
     static constexpr Capacity kFirstCapacity{64, 4096, 4096, 4096, 4096};
     Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
-    DeviceBuffer<float> records_;
-    DeviceBuffer<RecordBox> boxes_;
+    // Normals and instances of records, for channels.
+    DeviceBuffer<float> normals_;
+    DeviceBuffer<int32_t> instances_;
     DeviceBuffer<ItemTiles> item_tiles_;
-    DeviceBuffer<LargeRecord> large_;
-    DeviceBuffer<TileEntry> entries_;
-    DeviceBuffer<unsigned long long> scratch_;  // tile lists of small records, later spread lists
+    // The large buffers.
+    GrowingBuffer<float> records_;
+    DeviceBuffer<RecordBox> boxes_;  // of a tape
+    GrowingBuffer<LargeRecord> large_;
+    GrowingBuffer<TileEntry> entries_;
+    GrowingBuffer<unsigned long long> scratch_;  // tile lists of small records, later spread lists
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;

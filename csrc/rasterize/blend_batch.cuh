@@ -113,8 +113,8 @@ __device__ uint32_t subs_of(uint32_t blocks) {
 }
 
 // Clears the bits of blocks in s.alive_blocks if all pixels of the block have stopped.
-template <int kPixels>
-__device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
+template <int kPixels, class Shared>
+__device__ void publish_alive(bool is_alive, unsigned sub, Shared& s) {
     constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes per row of a block
     const uint32_t alive = __ballot_sync(kAllLanes, is_alive);
     uint32_t dead = 0;
@@ -151,8 +151,8 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
 
 // Returns the stop rule in a register. If the rule were a kernel argument, nvcc would
 // load it again for each gaussian.
-template <class Stop>
-__device__ Stop stop_of(const BlendShared& s) {
+template <class Stop, class Shared>
+__device__ Stop stop_of(const Shared& s) {
     if constexpr (std::is_same_v<Stop, StopsBefore>)
         return {};
     else
@@ -160,8 +160,8 @@ __device__ Stop stop_of(const BlendShared& s) {
 }
 
 // Blends the batch over one sub-tile. All lanes of the warp must call it.
-template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
+template <int kPixels, bool kWithDepth, class Stop, class Shared>
+__device__ void blend_sub(unsigned sub, int left, int top, Shared& s) {
     const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
     // The asm hides the lane index from the compiler. Otherwise the compiler would keep
@@ -265,8 +265,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
 
 // Blends the batch over the sub-tiles that contain any of the blocks in `reached`. All
 // threads of the block must call it.
-template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_batch(uint32_t reached, int left, int top, BlendShared& s) {
+template <int kPixels, bool kWithDepth, class Stop, class Shared>
+__device__ void blend_batch(uint32_t reached, int left, int top, Shared& s) {
     const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
     // Lane i stands for the sub-tile whose bit in `subs` is i, and counts the sub-tiles
     // before it.
@@ -278,7 +278,7 @@ __device__ void blend_batch(uint32_t reached, int left, int top, BlendShared& s)
         if (bit == 0) break;
         const unsigned block = __ffs(bit) - 1;
         blend_sub<kPixels, kWithDepth, Stop>(block / SubTile<kPixels>::kBlocks, left, top, s);
-        if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
+        if (threadIdx.x % 32 == 0) taken = Shared::kWarps + atomicAdd(&s.subs_taken, 1u);
         taken = __shfl_sync(kAllLanes, taken, 0);
     }
 }

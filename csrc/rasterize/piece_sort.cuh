@@ -9,20 +9,14 @@
 namespace v3dg {
 namespace cuda {
 
-constexpr int kBlendThreads = 128;
-constexpr int kBlendWarps = kBlendThreads / 32;
-// Entries that are read together.
-constexpr int kWindow = kEntriesAtOnce * kBlendThreads;
+constexpr int kWindow = 512;             // entries that are read together
 constexpr int kPiece = 3 * kWindow / 2;  // most entries that are sorted together
 // Log2 of the buckets when a list is spread a second time.
 constexpr int kLog2SpreadAgain = 10;
 constexpr int kLog2Sort = 9;         // log2 of the buckets for sorting a piece
 constexpr uint32_t kMostAlike = 12;  // a bucket with more entries is crowded
-// The number of sampled entries (one per thread) in crowded buckets, above which finer
-// buckets are used.
-constexpr uint32_t kMostCrowded = kBlendThreads / 4;
-constexpr int kFewEntries = 64;   // up to this many entries are sorted without buckets
-constexpr int kBlendBatch = 192;  // records that are blended together
+constexpr int kFewEntries = 64;      // up to this many entries are sorted without buckets
+constexpr int kBlendBatch = 192;     // records that are blended together
 // The largest number of times that a list is spread again. The range of the first level
 // is estimated. Each further level resolves at least 4 bits: first of the depth (26
 // bits), then of the order (28 bits).
@@ -39,8 +33,6 @@ struct SubTile {
     static constexpr int kBlocks = kWidth / kEntryBlockSize;
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
-
-static_assert(2 * kFewEntries <= kBlendThreads, "two threads compute the rank of each entry");
 
 // A part of the list that is in bucket order, and ends before `end`. It is in
 // lists.entries or in scratch memory.
@@ -65,13 +57,23 @@ struct TilePixels {
     alignas(float2) float color[3][kFrameTilePixels];
 };
 
+// The shared memory of a block of kBlendThreads threads.
+template <int kBlendThreads>
 struct BlendShared {
+    static constexpr int kThreads = kBlendThreads, kWarps = kThreads / 32;
+    static_assert(2 * kFewEntries <= kThreads, "two threads compute the rank of each entry");
+    // Loads in flight per thread when a window is read.
+    static constexpr int kAtOnce = kWindow / kThreads;
+    // The number of sampled entries (one per thread) in crowded buckets, above which
+    // finer buckets are used.
+    static constexpr uint32_t kMostCrowded = kThreads / 4;
+
     EntryKey key[kPiece];  // the entries of the piece, in any order
     union {
         SpreadShared<kLog2SpreadAgain> spreading;
         struct {
             uint32_t bucket[1 << kLog2Sort], finer[1 << kLog2Sort];
-            uint32_t warp_sum[kBlendWarps];
+            uint32_t warp_sum[kWarps];
             uint16_t by_bucket[kPiece];
         };
         // The batch's records, without their boxes.
@@ -83,7 +85,7 @@ struct BlendShared {
     // Per warp: the records that may reach its sub-tile, as addresses in shared memory.
     // An array is filled from its end to its beginning. Its first element is never set,
     // but may be loaded ahead.
-    uint16_t list[kBlendWarps][kBlendBatch + 1];
+    uint16_t list[kWarps][kBlendBatch + 1];
     TilePixels pixels;
     uint32_t alive_blocks;  // one bit per block, as in blocks_of(TileEntry)
     uint32_t reached[2];    // blocks that a batch reaches, for even and odd batches
@@ -100,35 +102,38 @@ struct BlendShared {
     // one: frames without depth do not allocate it.
     alignas(float2) float depth[kFrameTilePixels];
 };
-static_assert(sizeof(BlendShared) < 1 << 15,
+static_assert(sizeof(BlendShared<256>) < 1 << 15,
               "addresses in `list` have 16 bits, and BlendShared begins below 32 KiB");
 static_assert(kBlendBatch % 32 == 0, "a warp processes 32 records at once");
 
 // Returns the end of the bucket that contains entry `first`. The entries up to `last`
 // must be in bucket order.
-__device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,
-                                         const Buckets& buckets) {
+template <int kThreads>
+__device__ uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,
+                                  const Buckets& buckets) {
     const uint32_t bucket = buckets.of(entries[first].key);
-    for (uint32_t start = first; start < last; start += kBlendThreads) {
+    for (uint32_t start = first; start < last; start += kThreads) {
         const uint32_t i = start + threadIdx.x;
         const uint32_t inside =
             __syncthreads_count(i < last && buckets.of(entries[i].key) == bucket);
-        if (inside < kBlendThreads) return start + inside;
+        if (inside < kThreads) return start + inside;
     }
     return last;
 }
 
 // Adds to the piece the entries of [first, end) that cover live pixels and whose bucket
 // is before `beyond`. Returns the index at which it stopped, and the size of the piece.
-__device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
-                                    const Buckets& buckets, uint32_t beyond, uint32_t held,
-                                    uint32_t window_number, BlendShared& s) {
+template <class Shared>
+__device__ uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
+                             const Buckets& buckets, uint32_t beyond, uint32_t held,
+                             uint32_t window_number, Shared& s) {
+    constexpr int kAtOnce = Shared::kAtOnce;
     const int lane = threadIdx.x % 32;
     ListWindow& window = s.window[window_number % 3];
-    TileEntry entry[kEntriesAtOnce]{};
+    TileEntry entry[kAtOnce]{};
 #pragma unroll
-    for (int k = 0; k < kEntriesAtOnce; ++k) {
-        const uint32_t i = first + k * kBlendThreads + threadIdx.x;
+    for (int k = 0; k < kAtOnce; ++k) {
+        const uint32_t i = first + k * Shared::kThreads + threadIdx.x;
         if (i < end) entry[k] = entries[i];
     }
     if (threadIdx.x == 0) s.window[(window_number + 1) % 3] = {0, ~0u};
@@ -136,10 +141,10 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     const bool bounded = beyond != kNoBucket;
     const uint32_t beyond_begin = buckets.begin_of(beyond);
     const bool by_order = buckets.by_order;
-    uint32_t live[kEntriesAtOnce], total = 0, lowest = ~0u, highest = 0;
+    uint32_t live[kAtOnce], total = 0, lowest = ~0u, highest = 0;
 #pragma unroll
-    for (int k = 0; k < kEntriesAtOnce; ++k) {
-        const uint32_t i = first + k * kBlendThreads + threadIdx.x;
+    for (int k = 0; k < kAtOnce; ++k) {
+        const uint32_t i = first + k * Shared::kThreads + threadIdx.x;
         bool inside = i < end;
         const uint32_t depth = key_depth(entry[k]);
         if (bounded) {
@@ -166,7 +171,7 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
         }
         place = __shfl_sync(kAllLanes, place, 0);
 #pragma unroll
-        for (int k = 0; k < kEntriesAtOnce; ++k) {
+        for (int k = 0; k < kAtOnce; ++k) {
             if (live[k] >> lane & 1)
                 s.key[place + __popc(live[k] & ((1u << lane) - 1))] = entry[k].key;
             place += __popc(live[k]);
@@ -190,8 +195,9 @@ __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPla
 
 // Returns how many of the elements [first, last) of by_bucket precede the element at
 // index p.
-__device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
-                                        const RecordPlanes& records, const BlendShared& s) {
+template <class Shared>
+__device__ uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
+                                 const RecordPlanes& records, const Shared& s) {
     const auto entry_at = [&](uint32_t j) { return TileEntry{s.key[s.by_bucket[j]]}; };
     const TileEntry entry = entry_at(p);
     uint32_t before = 0;
@@ -221,20 +227,20 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
 
 // The steps of sorting a piece by buckets. The counter of a bucket is 0 first. Then it
 // is the first index of the bucket, and in the end the first index of the next bucket.
-template <class SomeBuckets>
+template <class SomeBuckets, class Shared>
 __device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
-                              BlendShared& s) {
-    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
+                              Shared& s) {
+    for (uint32_t i = threadIdx.x; i < count; i += Shared::kThreads)
         atomicAdd(&bucket[buckets.of(s.key[i])], 1u);
     __syncthreads();
 }
-template <class SomeBuckets>
+template <class SomeBuckets, class Shared>
 __device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket,
-                             const RecordPlanes& records, uint32_t count, BlendShared& s) {
-    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
+                             const RecordPlanes& records, uint32_t count, Shared& s) {
+    for (uint32_t i = threadIdx.x; i < count; i += Shared::kThreads)
         s.by_bucket[atomicAdd(&bucket[buckets.of(s.key[i])], 1u)] = static_cast<uint16_t>(i);
     __syncthreads();
-    for (uint32_t p = threadIdx.x; p < count; p += kBlendThreads) {
+    for (uint32_t p = threadIdx.x; p < count; p += Shared::kThreads) {
         const uint32_t i = s.by_bucket[p], own = buckets.of(s.key[i]);
         const uint32_t first = own > 0 ? bucket[own - 1] : 0;
         s.sorted[first + count_before(p, first, bucket[own], records, s)] =
@@ -244,7 +250,9 @@ __device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket,
 }
 
 // Sorts the piece: sets s.sorted.
-__device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, BlendShared& s) {
+template <class Shared>
+__device__ void sort_piece(const RecordPlanes& records, uint32_t count, Shared& s) {
+    constexpr int kThreads = Shared::kThreads;
     const Buckets buckets = buckets_over(s.lowest, s.highest, kLog2Sort, false);
     const bool few = count <= kFewEntries;
     if (few) {
@@ -256,7 +264,7 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         rank += __shfl_xor_sync(kAllLanes, rank, 1);
         if (i < count && threadIdx.x % 2 == 0) s.sorted[rank] = static_cast<uint16_t>(i);
     } else {
-        for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kBlendThreads) s.bucket[i] = 0;
+        for (int i = threadIdx.x; i < 1 << kLog2Sort; i += Shared::kThreads) s.bucket[i] = 0;
     }
     __syncthreads();
     if (threadIdx.x == 0) {  // reset for the next piece
@@ -270,15 +278,15 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
     const bool is_crowded =
         threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);
-    scan_buckets<1 << kLog2Sort, kBlendThreads>(s.bucket, s.warp_sum);
-    if (s.crowded <= kMostCrowded) {
+    scan_buckets<1 << kLog2Sort, kThreads>(s.bucket, s.warp_sum);
+    if (s.crowded <= Shared::kMostCrowded) {
         sort_buckets(buckets, s.bucket, records, count, s);
     } else {
         const FinerBuckets finer = finer_buckets(buckets, s.bucket, count, kLog2Sort);
-        for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kBlendThreads) s.finer[i] = 0;
+        for (int i = threadIdx.x; i < 1 << kLog2Sort; i += Shared::kThreads) s.finer[i] = 0;
         __syncthreads();
         count_buckets(finer, s.finer, count, s);
-        scan_buckets<1 << kLog2Sort, kBlendThreads>(s.finer, s.warp_sum);
+        scan_buckets<1 << kLog2Sort, kThreads>(s.finer, s.warp_sum);
         sort_buckets(finer, s.finer, records, count, s);
     }
     if (threadIdx.x == 0) s.crowded = 0;  // reset for the next piece

@@ -9,6 +9,8 @@
 
 #include "rasterize/rasterize.h"
 
+#include <algorithm>
+
 #include "base/copy_async.cuh"
 #include "rasterize/blend_batch.cuh"
 #include "rasterize/piece_sort.cuh"
@@ -19,14 +21,25 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-// Resident blocks per multiprocessor with 228 KiB of shared memory, without depth.
+// Most multiprocessors have room for few blocks' shared memory, but for more warps. So
+// there are two sizes of blocks: narrow ones for multiprocessors with 228 KiB of shared
+// memory, and wide ones, twice the warps of which share a block's memory. Both draw the
+// same bits.
+using Narrow = BlendShared<128>;
+using Wide = BlendShared<256>;
+// The number of blocks per multiprocessor for which registers suffice, without depth.
+template <class Shared>
 constexpr int kBlocks = 8;
+template <>
+constexpr int kBlocks<Wide> = 3;
+constexpr size_t kReservedBytes = 1024;  // of shared memory per block, for the driver
 // The average number of blocks per record from which on a lane blends two pixels. The
 // values 4, 7 and 10 differ by 1 % in time.
 constexpr int kBlocksForPairs = 5;
 
-static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10,
-              "the driver reserves 1024 bytes of shared memory per block");
+template <class Shared>
+constexpr size_t kBytes = offsetof(Shared, depth) + kReservedBytes;  // without depth
+static_assert(kBlocks<Narrow> * kBytes<Narrow> <= 228 << 10);
 
 // Returns a mask of the blocks in a part of a tile: all of it, a half or a quarter.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
@@ -35,12 +48,12 @@ __device__ uint32_t blocks_of_part(int part, int log2_parts) {
 }
 
 // Blends the sorted piece.
-template <bool kWithDepth, class Stop>
+template <bool kWithDepth, class Stop, class Shared>
 __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int left, int top,
-                            BlendShared& s) {
+                            Shared& s) {
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBlendBatch) {
         const uint32_t turn = first / kBlendBatch % 2;
-        for (uint32_t i = threadIdx.x; i < kBlendBatch; i += kBlendThreads) {
+        for (uint32_t i = threadIdx.x; i < kBlendBatch; i += Shared::kThreads) {
             uint32_t blocks = 0;
             if (first + i < count) {
                 const TileEntry entry{s.key[s.sorted[first + i]]};
@@ -69,7 +82,7 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
         // If there are fewer large sub-tiles than warps, small sub-tiles keep all warps
         // busy.
         if (s.num_covered[turn] >= kBlocksForPairs * num_records &&
-            __popc(subs_of<2>(reached)) >= kBlendWarps)
+            __popc(subs_of<2>(reached)) >= Shared::kWarps)
             blend_batch<2, kWithDepth, Stop>(reached, left, top, s);
         else
             blend_batch<1, kWithDepth, Stop>(reached, left, top, s);
@@ -81,11 +94,11 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
 // Blends the list of a tile. Returns the number of entries that were not dropped. If
 // the list is divided into windows, `window_ends` has their ends, and the list is in
 // scratch memory; otherwise `window_ends` is null.
-template <bool kWithDepth, class Stop>
+template <bool kWithDepth, class Stop, class Shared>
 __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
                                const uint32_t* window_ends, uint32_t* order, int left, int top,
-                               BlendShared& s) {
+                               Shared& s) {
     int depth = 0;  // number of levels in use
     if (count > kPiece && window_ends == nullptr) {
         if (threadIdx.x == 0) s.level[0] = {count, plan.in_scratch, spread_buckets};
@@ -129,11 +142,12 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
                 continue;
             }
             // If not even one bucket fits, spread that bucket again.
-            const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
+            const uint32_t end =
+                end_of_bucket<Shared::kThreads>(from, done, level.end, level.buckets);
             const Buckets buckets =
-                find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);
-            spread<kBlendThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets,
-                                  s.spreading.bucket, s.spreading.warp_sum);
+                find_buckets<Shared::kThreads>(from, done, end, false, false, s.spreading);
+            spread<Shared::kThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets,
+                                     s.spreading.bucket, s.spreading.warp_sum);
             if (threadIdx.x == 0) s.level[depth] = {end, !level.in_scratch, buckets};
             __syncthreads();
             ++depth;
@@ -141,7 +155,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
         if (held == 0) break;
         sort_piece(records, held, s);
         if (order != nullptr)
-            for (uint32_t i = threadIdx.x; i < held; i += kBlendThreads)
+            for (uint32_t i = threadIdx.x; i < held; i += Shared::kThreads)
                 order[blended + i] = records.record_of(TileEntry{s.key[s.sorted[i]]});
         blended += held;
         blend_piece<kWithDepth, Stop>(records, held, left, top, s);
@@ -154,10 +168,10 @@ __device__ const PicturePlanes& planes_of(const FrameLists& lists, const FrameIm
     return image.planes.color != nullptr ? image.planes : lists.planes[&image - lists.images];
 }
 
-template <bool kWithDepth, class Stop>
+template <bool kWithDepth, class Stop, class Shared>
 __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, const TilePlan& plan,
                            const Buckets& spread_buckets, uint32_t own_blocks,
-                           const FrameImage& image, BlendShared& s) {
+                           const FrameImage& image, Shared& s) {
     const uint32_t tile = plan.tile;
     const int in_image = static_cast<int>(tile - image.first_tile);
     const int left = in_image % image.tile_columns * kFrameTileWidth;
@@ -167,7 +181,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     // pair in each of its sub-tiles.
     using Sub = SubTile<2>;
     const auto for_each_pair = [&](const auto& visit) {
-        for (int sub = warp; sub < Sub::kCount; sub += kBlendWarps)
+        for (int sub = warp; sub < Sub::kCount; sub += Shared::kWarps)
             if ((own_blocks & blocks_of_sub<2>(sub)) != 0)
                 visit(sub, place_of<2>(sub, lane),
                       left + sub % Sub::kColumns * Sub::kWidth + 2 * (lane % 8),
@@ -226,32 +240,33 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
 }
 
 // Fills the marked images with NaN, so that old pixels are not mistaken for new ones.
+template <class Shared>
 __device__ void mark_undrawn(const FrameLists& lists) {
     for (uint32_t k = blockIdx.x; k < lists.num_marked; k += gridDim.x) {
         const FrameImage& image = lists.images[k];
         const PicturePlanes& planes = image.planes;
         const size_t num_pixels = size_t(image.width) * image.height;
         const size_t num_channels = planes.has_four_channels ? 4 : 3;
-        for (size_t i = threadIdx.x; i < num_channels * num_pixels; i += kBlendThreads)
+        for (size_t i = threadIdx.x; i < num_channels * num_pixels; i += Shared::kThreads)
             planes.color[i] = NAN;
-        for (size_t i = threadIdx.x; i < num_pixels; i += kBlendThreads) {
+        for (size_t i = threadIdx.x; i < num_pixels; i += Shared::kThreads) {
             if (planes.alpha != nullptr) planes.alpha[i] = NAN;
             if (planes.depth != nullptr) planes.depth[i] = NAN;
         }
     }
 }
 
-template <class Stop>
-__global__ void __launch_bounds__(kBlendThreads, kBlocks)
+template <class Shared, class Stop>
+__global__ void __launch_bounds__(Shared::kThreads, kBlocks<Shared>)
     rasterize_kernel(FrameLists lists, RasterTape tape) {
     await_kernel_before();
     if (blockIdx.x == 0 && threadIdx.x == 0 && lists.report != nullptr)
         *lists.report = *lists.counters;
     if (!lists.capacity.holds(*lists.counters)) {
-        mark_undrawn(lists);
+        mark_undrawn<Shared>(lists);
         return;
     }
-    BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
+    Shared& s = *reinterpret_cast<Shared*>(shared_memory());
     if (lists.plans[blockIdx.x].tile == kNoTile) return;
     const int part = lists.plans[blockIdx.x].part;
     const TilePlan& plan = lists.plans[blockIdx.x - part];
@@ -267,7 +282,30 @@ __global__ void __launch_bounds__(kBlendThreads, kBlocks)
         blend_tile<false, Stop>(lists, tape, plan, buckets, own_blocks, image, s);
 }
 
-uint32_t num_places() { return static_cast<uint32_t>(kBlocks) * num_multiprocessors(); }
+// Returns whether the current device has room for all narrow blocks.
+bool has_room_for_narrow() {
+    return kBlocks<Narrow> * kBytes<Narrow> <= shared_memory_of_multiprocessor();
+}
+
+template <class Shared>
+uint32_t num_places_for() {
+    const size_t blocks = shared_memory_of_multiprocessor() / kBytes<Shared>;
+    return static_cast<uint32_t>(std::min<size_t>(blocks, kBlocks<Shared>)) * num_multiprocessors();
+}
+
+// Returns how many blocks the current device blends at once.
+uint32_t num_places() {
+    return has_room_for_narrow() ? num_places_for<Narrow>() : num_places_for<Wide>();
+}
+
+template <class Shared>
+void blend(const FrameLists& lists, const RasterTape& tape, cudaStream_t stream) {
+    const size_t shared_bytes = lists.has_depth ? sizeof(Shared) : offsetof(Shared, depth);
+    with_stop<float>(lists.min_transmittance, [&](auto stop) {
+        launch_early("rasterize_kernel", rasterize_kernel<Shared, decltype(stop)>, lists.num_plans,
+                     Shared::kThreads, shared_bytes, stream, lists, tape);
+    });
+}
 
 }  // namespace
 
@@ -275,13 +313,11 @@ uint32_t most_plans(uint32_t num_tiles) { return most_plans(num_tiles, num_place
 
 void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream) {
     spread_lists(lists, num_places(), stream);
-    const size_t shared_bytes =
-        lists.has_depth ? sizeof(BlendShared) : offsetof(BlendShared, depth);
-    with_stop<float>(lists.min_transmittance, [&](auto stop) {
-        launch_early("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans,
-                     kBlendThreads, shared_bytes, stream, lists,
-                     tape == nullptr ? RasterTape{} : *tape);
-    });
+    const RasterTape kept = tape == nullptr ? RasterTape{} : *tape;
+    if (has_room_for_narrow())
+        blend<Narrow>(lists, kept, stream);
+    else
+        blend<Wide>(lists, kept, stream);
 }
 
 }  // namespace cuda

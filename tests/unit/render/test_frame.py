@@ -1,6 +1,7 @@
 """Frames on CUDA equal the pictures of the CPU, whatever the stream, the buffers and
 the frames before."""
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -169,13 +170,78 @@ def test_buffers_that_were_too_small_leave_no_trace():
     assert_same_bytes(second, third)
 
 
+def memory_of(renderer):
+    return renderer._frame.chosen(renderer.subject).core.memory()
+
+
 def test_memory_of_a_frame_is_told_by_part():
     renderer = Renderer(composed_scene(np.random.default_rng(4)), device="cuda")
     count = renderer.render(CAMERA, tolerance=0.0).stats.gaussians_selected
-    parts = renderer._frame.chosen(renderer.subject).core.memory()
+    parts = memory_of(renderer)
     reserved, used = parts.pop("pool, reserved"), parts.pop("pool, used")
     assert parts["records"] >= 40 * count > 0
-    assert sum(parts.values()) <= used <= reserved
+    in_place = ("records", "entries", "scratch", "large")
+    assert sum(parts[name] for name in parts.keys() - set(in_place)) <= used <= reserved
+
+
+def crowd():
+    """A scene of two million gaussians."""
+    rng = np.random.default_rng(4)
+    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 20_000), 512)
+    scene = Scene()
+    scene.add(bundle, positions=rng.uniform(-0.5, 0.5, (100, 3)))
+    return scene
+
+
+def drawn(renderer):
+    """Return the number of gaussians of a frame of all gaussians, which is done."""
+    return renderer.render(CAMERA, tolerance=0.0).stats.gaussians_selected
+
+
+def test_buffers_exceed_a_frame_by_a_sixteenth():
+    renderer = Renderer(crowd(), device="cuda")
+    count = drawn(renderer)
+    page = 2 << 20
+    assert count > 1_000_000
+    assert 40 * count <= memory_of(renderer)["records"] <= 40 * count * 17 / 16 + page
+
+
+def test_memory_of_a_frame_returns_to_the_device():
+    import torch
+
+    scene = crowd()
+    drawn(Renderer(scene, device="cuda"))  # loads kernels and tables
+    gc.collect()
+    before = torch.cuda.mem_get_info()[0]
+    renderer = Renderer(scene, device="cuda")
+    drawn(renderer)
+    num_bytes = memory_of(renderer)["records"]
+    between = torch.cuda.mem_get_info()[0]
+    del renderer
+    gc.collect()
+    assert num_bytes > 40e6
+    assert before - between >= num_bytes
+    assert torch.cuda.mem_get_info()[0] - between >= num_bytes
+
+
+def test_full_device_is_a_memory_error_of_a_frame():
+    import torch
+
+    scene = crowd()
+    expected = Renderer(scene, device="cuda").render(CAMERA, tolerance=0.0)
+    renderer = Renderer(scene, device="cuda")
+    renderer.render(CAMERA, tolerance=np.inf).stats  # noqa: B018  waits
+    gc.collect()
+    torch.cuda.empty_cache()
+    free = torch.cuda.mem_get_info()[0]
+    rest = torch.empty(max(0, free - (48 << 20)), dtype=torch.uint8, device="cuda")
+    try:
+        with pytest.raises(MemoryError, match=r"requested .* MiB, free: .* MiB of .* MiB"):
+            drawn(renderer)
+    finally:
+        del rest
+        torch.cuda.empty_cache()
+    assert_same_bytes(renderer.render(CAMERA, tolerance=0.0), expected)
 
 
 def test_every_renderer_draws_the_same_bytes():

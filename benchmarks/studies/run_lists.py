@@ -1,0 +1,274 @@
+"""How long would the lists of tiles be if they held runs of records?
+
+    python -m benchmarks.studies.run_lists \\
+        --layout donutsea.json --bundle donut.v3dg --tolerance 9.4 -o run_lists
+
+On CUDA, each record puts an entry of 8 bytes into the list of every tile that it may
+reach. A warp writes up to 32 records of neighbouring gaussians at once: a run. If
+lists held pairs of a run and a tile, a block would take the runs of its tile by their
+nearest depth, and find their entries itself.
+
+For each camera, the study projects the cut and counts records, entries and pairs.
+It also follows the lists from front to back: how many pairs a tile takes until its
+pixels have stopped, how many entries these pairs have, and how many entries wait at
+once because a run that was not taken may be nearer. A tile counts as stopped when the
+mean of its gaussians' opacities, as an optical depth over its pixels, exceeds
+`--depth`; that is an estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+import v3dg
+from benchmarks.evaluation import record
+from benchmarks.evaluation.assets import read_layout
+from v3dg import _core
+from v3dg._json import JsonObject
+from v3dg.cameras import Camera
+from v3dg.select import Selection
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+# As in csrc/frame: the size of a tile in px, records over more tiles than this are
+# large, and the number of gaussians of an item.
+_TILE_WIDTH, _TILE_HEIGHT, _FEW_TILES, _ITEM = 32, 16, 4, 256
+_RUN = 32  # records of a run
+_MIN_ALPHA = 1 / 255
+_AT_ONCE = 1_000_000  # gaussians that are projected together
+# The blend stage sorts at most this many entries at once.
+_PIECE = 768
+
+
+@dataclass
+class Config:
+    layout: Path
+    bundle: Path
+    """Bundle of the layout's asset."""
+    cameras: tuple[int, ...] = (42, 46, 50, 59)
+    tolerance: float = 9.4
+    depth: float = 14.0
+    """Mean optical depth of a tile at which all its pixels count as stopped."""
+    output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+
+
+@dataclass
+class Records:
+    """(N,) records in the order of a frame: boxes of tiles, depths, runs, and the
+    optical depth that a record adds to all its tiles, times the pixels of a tile."""
+
+    left: Ints
+    right: Ints
+    top: Ints
+    bottom: Ints
+    depth: Floats
+    run: Ints
+    cover: Floats
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+    @property
+    def num_tiles(self) -> Ints:
+        return (self.right - self.left + 1) * (self.bottom - self.top + 1)
+
+
+@dataclass
+class Entries:
+    """(E,) entries, sorted by tile and depth."""
+
+    tile: Ints
+    depth: Floats
+    run: Ints
+    cover: Floats
+
+
+def parts_of(cut: Selection) -> Iterator[Selection]:
+    """Yield the cut in parts of whole instances."""
+    sizes = np.diff(cut._first())
+    part = np.cumsum(sizes) // _AT_ONCE
+    is_first = np.r_[True, np.diff(cut.instance_ids) != 0]
+    part = np.maximum.accumulate(np.where(is_first, part, 0))
+    for number in np.unique(part):
+        rows = np.flatnonzero(part == number)
+        yield Selection(
+            cut.scene,
+            cut.instance_ids[rows].copy(),
+            cut.cluster_ids[rows].copy(),
+            int(sizes[rows].sum()),
+            cut.tolerance,
+            0.0,
+            cut.revision,
+        )
+
+
+def items_of(part: Selection) -> Ints:
+    """Return the item of each gaussian. Neighbouring clusters of an instance are cut
+    into items together."""
+    sizes = np.diff(part._first())
+    starts = np.ones(len(part), bool)
+    starts[1:] = (np.diff(part.instance_ids) != 0) | (np.diff(part.cluster_ids) != 1)
+    joined = np.cumsum(starts) - 1
+    of_gaussian = np.repeat(joined, sizes)
+    first = np.flatnonzero(np.r_[True, np.diff(of_gaussian) != 0])
+    length = np.diff(np.r_[first, len(of_gaussian)])
+    within = np.arange(len(of_gaussian)) - np.repeat(first, length)
+    return np.cumsum(within % _ITEM == 0) - 1
+
+
+def project(part: Selection, camera: Camera) -> Records:
+    gaussians = part.gaussians(device="cpu")
+    filters = part.filters_px2
+    centers = np.zeros((len(filters), 2), np.float32)
+    conics = np.zeros((len(filters), 3), np.float32)
+    depths = np.zeros(len(filters), np.float32)
+    opacities = np.zeros(len(filters), np.float32)
+    for filter_px2 in np.unique(filters):
+        rows = np.flatnonzero(filters == filter_px2)
+        seen = _core.ellipses(
+            gaussians.subset(rows).rows,
+            camera.core,
+            filter_px2=float(filter_px2),
+            antialiased=False,
+            far_depth=np.inf,
+            min_radius_px=0.0,
+        )
+        centers[rows] = np.asarray(seen.centers)
+        conics[rows] = np.asarray(seen.conics)
+        depths[rows] = np.asarray(seen.depths)
+        opacities[rows] = np.asarray(seen.opacities)
+    return records_of(camera, centers, conics, depths, opacities, items_of(part))
+
+
+def records_of(
+    camera: Camera, centers: Floats, conics: Floats, depths: Floats, opacities: Floats, item: Ints
+) -> Records:
+    """Return the records of gaussians that reach a pixel centre."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = 2 * np.log(np.maximum(opacities / _MIN_ALPHA, 1))
+        determinant = conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2
+        half = np.sqrt(reach[:, None] * conics[:, [2, 0]] / determinant[:, None])
+        area = 2 * np.pi * opacities / np.sqrt(determinant)
+    low = np.ceil(np.maximum(centers - half - 0.5, 0))
+    high = np.floor(np.minimum(centers + half - 0.5, [camera.width - 1, camera.height - 1]))
+    kept = np.flatnonzero((opacities > _MIN_ALPHA) & (low <= high).all(axis=1))
+    low = low[kept].astype(np.int64)
+    high = high[kept].astype(np.int64)
+    items = item[kept]
+    first = np.flatnonzero(np.r_[True, np.diff(items) != 0])
+    length = np.diff(np.r_[first, len(items)])
+    within = np.arange(len(items)) - np.repeat(first, length)
+    return Records(
+        left=low[:, 0] // _TILE_WIDTH,
+        right=high[:, 0] // _TILE_WIDTH,
+        top=low[:, 1] // _TILE_HEIGHT,
+        bottom=high[:, 1] // _TILE_HEIGHT,
+        depth=depths[kept],
+        run=np.cumsum(within % _RUN == 0) - 1,
+        cover=area[kept].astype(np.float32),
+    )
+
+
+def concatenated(parts: list[Records]) -> Records:
+    first_run = np.cumsum([0, *(int(part.run.max(initial=-1)) + 1 for part in parts)])
+    for part, first in zip(parts, first_run, strict=False):
+        part.run = part.run + first
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Records(*(np.concatenate(column) for column in columns))
+
+
+def entries_of(records: Records, columns: int) -> Entries:
+    counts = records.num_tiles
+    row = np.repeat(np.arange(len(records)), counts)
+    k = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+    across = (records.right - records.left + 1)[row]
+    tile = (records.top[row] + k // across) * columns + records.left[row] + k % across
+    depth = records.depth[row]
+    order = np.lexsort((depth, tile))
+    row = row[order]
+    cover = records.cover[row] / counts[row]
+    return Entries(tile[order], depth[order], records.run[row], cover.astype(np.float32))
+
+
+def count(config: Config, records: Records, columns: int) -> JsonObject:
+    entries = entries_of(records, columns)
+    num_runs = int(records.run.max()) + 1
+    nearest = np.full(num_runs, np.inf, np.float32)
+    np.minimum.at(nearest, records.run, records.depth)
+    pair, entries_in_pair = np.unique(entries.tile * num_runs + entries.run, return_counts=True)
+    of_run = np.bincount(pair % num_runs, minlength=num_runs)
+    tiles_of_records = np.bincount(records.run, records.num_tiles, num_runs)
+    is_suited = tiles_of_records >= 2 * of_run
+    is_large = records.num_tiles > _FEW_TILES
+    writes = int(of_run[is_suited].sum() + tiles_of_records[~is_suited].sum())
+    result: JsonObject = {
+        "records": len(records),
+        "large_records": round(float(is_large.mean()), 4),
+        "entries": len(entries.tile),
+        "entries_of_large_records": int(records.num_tiles[is_large].sum()),
+        "runs": num_runs,
+        "pairs": len(pair),
+        "pairs_of_entries": round(len(pair) / len(entries.tile), 4),
+        "writes_with_unsuited_runs": writes,
+        "writes_of_entries": round(writes / len(entries.tile), 4),
+        "entries_in_a_pair": round(float(entries_in_pair.mean()), 2),
+        "tiles_of_a_run": round(float(of_run.mean()), 2),
+    }
+    return result | follow(config, entries, nearest)
+
+
+def follow(config: Config, entries: Entries, nearest: Floats) -> JsonObject:
+    """Follow each tile's list from front to back until its pixels have stopped."""
+    first = np.flatnonzero(np.r_[True, np.diff(entries.tile) != 0])
+    ends = np.r_[first[1:], len(entries.tile)]
+    taken_entries = taken_pairs = listed_records = 0
+    waiting: list[int] = []
+    longest_lists = [0]
+    full = config.depth * _TILE_WIDTH * _TILE_HEIGHT
+    for begin, end in zip(first, ends, strict=True):
+        near = nearest[entries.run[begin:end]]
+        depth = entries.depth[begin:end]
+        stop = int(np.searchsorted(np.cumsum(entries.cover[begin:end]), full)) + 1
+        stop = min(stop, end - begin)
+        pairs = np.unique(entries.run[begin:end][near <= depth[stop - 1]])
+        longest_lists.append(len(np.unique(entries.run[begin:end])))
+        taken_entries += int(stop)
+        taken_pairs += len(pairs)
+        listed_records += int((near <= depth[stop - 1]).sum())
+        # After each piece, entries of runs that begin before this depth are waiting.
+        for k in range(_PIECE // 2, stop, _PIECE // 2):
+            waiting.append(int((near[k:] <= depth[k]).sum()))
+    return {
+        "entries_until_stopped": taken_entries,
+        "pairs_until_stopped": taken_pairs,
+        "entries_of_these_pairs": listed_records,
+        "entries_that_wait": [int(n) for n in np.percentile(waiting or [0], [50, 90, 95, 99, 100])],
+        "longest_list_of_pairs": int(max(longest_lists)),
+    }
+
+
+def main(config: Config) -> None:
+    scene, cameras = read_layout(config.layout, v3dg.Bundle.open(config.bundle))
+    rows: list[JsonObject] = []
+    for number in config.cameras:
+        camera = list(cameras.values())[number]
+        cut = v3dg.select(scene, camera, tolerance=config.tolerance, device="cpu")
+        records = concatenated([project(part, camera) for part in parts_of(cut)])
+        columns = -(-camera.width // _TILE_WIDTH)
+        row: JsonObject = {"camera": number, "tolerance": config.tolerance}
+        row["gaussians"] = cut.num_gaussians
+        rows.append(row | count(config, records, columns))
+        print(rows[-1], flush=True)
+        record.write(config.output, {"rows": rows})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
