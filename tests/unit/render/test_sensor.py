@@ -33,9 +33,11 @@ def camera_at(eye=(0, -6, 1)):
 
 
 def mesh_of(shape, seed=0, **planes):
+    """Return a mesh before, between and behind the gaussians of the scene."""
     rng = np.random.default_rng(seed)
     coverage = rng.choice([0.0, 0.4, 1.0], shape)
-    return MeshLayer(rng.uniform(0, 1, (*shape, 3)), rng.uniform(3, 9, shape), coverage, **planes)
+    depth = np.exp(rng.uniform(np.log(0.03), np.log(30), shape))
+    return MeshLayer(rng.uniform(0, 1, (*shape, 3)), depth, coverage, **planes)
 
 
 def assert_same(image, other, planes=PLANES):
@@ -95,6 +97,7 @@ def test_a_batch_has_the_channels_of_each_camera_alone(scene):
     renderer = v3dg.Renderer(scene, device="cpu")
     batch = renderer.render_batch(cameras, channels=CHANNELS, mesh=mesh)
     assert batch.normal.shape == (5, HEIGHT, WIDTH, 3)
+    assert 0.1 < (batch.instance == 99).mean() < 0.9
     for number, camera in enumerate(cameras):
         layer = MeshLayer(
             mesh.color[number],

@@ -60,23 +60,22 @@ def cameras_around(count, radius=6.0):
 
 
 def mesh_of(shape, seed=0, **planes):
+    """Return a mesh before, between and behind the gaussians of the scene."""
     rng = np.random.default_rng(seed)
     coverage = rng.choice([0.0, 0.4, 1.0], shape)
     normal = rng.normal(size=(*shape, 3))
-    return MeshLayer(
-        rng.uniform(0, 1, (*shape, 3)), rng.uniform(1, 9, shape), coverage, normal, **planes
-    )
+    depth = np.exp(rng.uniform(np.log(0.03), np.log(30), shape))
+    return MeshLayer(rng.uniform(0, 1, (*shape, 3)), depth, coverage, normal, **planes)
 
 
 def part_of(mesh, number):
     """Return the mesh of one camera of a batch."""
-    return dataclasses.replace(
-        mesh,
-        color=mesh.color[number],
-        depth=mesh.depth[number],
-        coverage=mesh.coverage[number],
-        normal=mesh.normal[number],
-    )
+    planes = {}
+    for name in ("color", "depth", "coverage", "normal", "instance", "label"):
+        plane = getattr(mesh, name)
+        if plane is not None:
+            planes[name] = plane[number]
+    return dataclasses.replace(mesh, **planes)
 
 
 def tensors_of(cameras, **options):
