@@ -276,6 +276,10 @@ class Tape:
     """The data that rasterize stores for rasterize_backward. It keeps the gaussians
     alive."""
 
+class ViewsTape:
+    """The data that rasterize_views stores for rasterize_views_backward. It keeps the
+    gaussians alive."""
+
 class RenderCounts:
     """Statistics of a picture that was drawn on the host."""
 
@@ -314,10 +318,31 @@ class Rasterized:
     @property
     def tape(self) -> Tape | None: ...
 
-class Gradients:
-    """Gradients with respect to the inputs of a picture.
+class RasterizedViews:
+    """Pictures of gaussians without levels for V cameras.
 
     Attributes:
+        color: (V, H, W, 3) colour over the backgrounds.
+        alpha: (V, H, W) opacity.
+        depth: (V, H, W) expected depth; None unless it was requested.
+        tape: Data for the backward pass; None unless it was requested.
+    """
+
+    @property
+    def color(self) -> Array: ...
+    @property
+    def alpha(self) -> Array: ...
+    @property
+    def depth(self) -> Array | None: ...
+    @property
+    def tape(self) -> ViewsTape | None: ...
+
+class Gradients:
+    """Gradients with respect to the inputs of a picture, or of several.
+
+    Attributes:
+        poses: (V, 3, 4) gradients with respect to the world-to-camera matrices of V
+            cameras, or None.
         centers: (N, 2) gradient with respect to the centres on the image, or None.
         center_sizes: (N, 2) sum over pixels of the absolute gradients with respect to
             the centres, or None.
@@ -335,6 +360,8 @@ class Gradients:
     def sh(self) -> Array: ...
     @property
     def background(self) -> Array: ...
+    @property
+    def poses(self) -> Array | None: ...
     @property
     def centers(self) -> Array | None: ...
     @property
@@ -440,6 +467,35 @@ def rasterize_backward(
     with_sizes: bool = ...,
 ) -> Gradients: ...
 
+# Draws gaussians for several pinholes, whose arrays are on the CPU. `gaussians` and
+# `backgrounds` are those of all cameras, or of each camera.
+def rasterize_views(
+    gaussians: Sequence[Rows],
+    cameras: Cameras,
+    *,
+    filter_px2: float,
+    antialiased: bool,
+    backgrounds: Sequence[Sequence[float]],
+    with_depth: bool,
+    keep_tape: bool,
+    plain_colors: bool = ...,
+) -> RasterizedViews: ...
+
+# The gradients are sums over the cameras, apart from centres, backgrounds, poses, and
+# those that are requested for each view.
+def rasterize_views_backward(
+    tape: ViewsTape,
+    d_color: Array | None,
+    d_alpha: Array | None,
+    d_depth: Array | None,
+    *,
+    with_centers: bool = ...,
+    with_sizes: bool = ...,
+    with_poses: bool = ...,
+    opacities_for_each_view: bool = ...,
+    sh_for_each_view: bool = ...,
+) -> Gradients: ...
+
 # Returns (G,) the factors by which the balls of level 1 must grow, so that groups are
 # selected at a suitable size.
 def first_selected(
@@ -462,6 +518,18 @@ def ellipses(
     far_depth: float,
     min_radius_px: float,
 ) -> Ellipses: ...
+
+# Returns centres (V, N, 2), depths (V, N), conics (V, N, 3), opacities (V, N) and radii
+# (V, N, 2).
+def ellipses_of_views(
+    gaussians: Rows,
+    cameras: Cameras,
+    *,
+    filter_px2: float,
+    antialiased: bool,
+    far_depth: float,
+    min_radius_px: float,
+) -> tuple[Array, Array, Array, Array, Array]: ...
 
 class Stop:
     """A flag with which any thread can stop a picture in progress, which then stays

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from v3dg.io import loaded
 
 if TYPE_CHECKING:
     import torch
+
+_T = TypeVar("_T")
 
 
 def rasterize(
@@ -88,7 +90,9 @@ def rasterize(
     arrays = [means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
     arrays.append(torch.as_tensor(background, dtype=means.dtype))
     settings = DrawSettings(filter_px2=filter_px2, antialiased=antialiased)
-    return Image(*draw_views([camera.core], settings, [[array] for array in arrays]))
+    views = Views(cameras=(camera.core,), num_cameras=1)
+    planes = draw_views(views, settings, [[array] for array in arrays])
+    return Image(*(plane.squeeze(0) for plane in planes))
 
 
 def check_device(means: Array) -> None:
@@ -121,6 +125,38 @@ class DrawSettings:
     plain_colors: bool = False  # whether sh contains colours instead of coefficients
 
 
+@dataclass(frozen=True, eq=False)
+class Views:
+    """The cameras of S sets of gaussians: C for each set, so that there are V = S * C
+    views.
+
+    Attributes:
+        cameras: The cameras of each set: one camera of any model, which is quicker than
+            a batch of one; or C pinholes whose arrays are on the CPU.
+        num_cameras: C.
+        viewmats: (V, 4, 4) tensor of the poses, if they have gradients. The cameras
+            must then be `_core.Cameras`.
+    """
+
+    cameras: tuple[_core.Camera | _core.Cameras, ...]
+    num_cameras: int
+    viewmats: torch.Tensor | None = None
+
+    @property
+    def num_views(self) -> int:
+        return len(self.cameras) * self.num_cameras
+
+    def inputs_of(self, group: Sequence[_T], number: int) -> Sequence[_T]:
+        """Return the values that a set uses, from one value for all views, one for each
+        set, or one for each view."""
+        if len(group) == self.num_views > len(self.cameras):
+            first = number * self.num_cameras
+            return group[first : first + self.num_cameras]
+        if len(group) == 1:
+            return group
+        return group[number : number + 1]
+
+
 @dataclass(eq=False)
 class CenterGradient:
     """The gradient with respect to the centres on the images. The backward pass sets
@@ -135,8 +171,9 @@ class CenterProbe:
     gaussians' centres.
 
     Attributes:
-        centers: Centres (V, N, 2)[pairs] for V views and N gaussians. Their values are
-            not used; they exist so that autograd provides their gradient.
+        centers: Centres (V, N, 2)[pairs] for V views and N gaussians, in any shape.
+            Their values are not used; they exist so that autograd provides their
+            gradient.
         pairs: The index that selects the rows in `centers`.
         with_sizes: Whether `centers.absgrad` becomes the sum over pixels of absolute
             gradients.
@@ -152,35 +189,57 @@ class CenterProbe:
 
 
 def draw_views(
-    cameras: Sequence[_core.Camera],
+    views: Views,
     settings: DrawSettings,
     inputs: Sequence[Sequence[torch.Tensor]],
     probe: CenterProbe | None = None,
 ) -> tuple[torch.Tensor, ...]:
     """Draw tensors differentiably. Return colour, alpha and depth (or None) of the
-    first view, then those of the next view, and so on.
+    first set, (C, H, W, ...), then those of the next set, and so on.
 
     Args:
-        cameras: V cameras.
         inputs: For each of means, quats, scales, opacities, sh and backgrounds: one
-            tensor, or several that are assigned to the views cyclically.
+            tensor, or one for each set; of the last three also one for each view.
         probe: Receives the gradient with respect to the centres on the images.
     """
     import torch
 
     tensors = [tensor for group in inputs for tensor in group]
-    keep_tape = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    counts = [len(group) for group in inputs]
-    centers = None
+    optional = [None, views.viewmats]
     if probe is not None:
-        centers = probe.centers
-    return tuple(_function()(cameras, settings, keep_tape, counts, probe, centers, *tensors))
+        optional[0] = probe.centers
+    keep_tape = torch.is_grad_enabled() and any(
+        tensor is not None and tensor.requires_grad for tensor in (views.viewmats, *tensors)
+    )
+    call = _Call(
+        views=Views(views.cameras, views.num_cameras),  # the poses are passed as tensors
+        settings=settings,
+        counts=[len(group) for group in inputs],
+        keep_tape=keep_tape,
+        probe=probe,
+    )
+    return tuple(_function()(call, *optional, *tensors))
 
 
-def _slots_of_view(counts: list[int], view: int) -> list[int]:
-    """Return, for each kind of input, the index (among all tensors) of the tensor that
-    a view uses."""
-    return [sum(counts[:kind]) + view % count for kind, count in enumerate(counts)]
+@dataclass(frozen=True, eq=False)
+class _Call:
+    """The arguments of `draw_views` that are not tensors."""
+
+    views: Views
+    settings: DrawSettings
+    counts: list[int]  # number of tensors of each kind of input
+    keep_tape: bool
+    probe: CenterProbe | None
+
+    def slots_of_set(self, number: int) -> list[Sequence[int]]:
+        """Return, for each kind of input, the indices (among all tensors) of the
+        tensors that a set uses."""
+        slots: list[Sequence[int]] = []
+        first = 0
+        for count in self.counts:
+            slots.append(self.views.inputs_of(range(first, first + count), number))
+            first += count
+        return slots
 
 
 def _to_core(gradient: torch.Tensor | None) -> Array | None:
@@ -192,31 +251,66 @@ def _to_core(gradient: torch.Tensor | None) -> Array | None:
     return gradient.numpy()
 
 
-def _draw_view(
-    camera: _core.Camera, settings: DrawSettings, inputs: Sequence[torch.Tensor], *, keep_tape: bool
-) -> tuple[list[torch.Tensor | None], _core.Tape | None]:
-    """Return colour, alpha and depth of one view, and the data for its backward
-    pass."""
+def _alone(plane: Array | None) -> Array | None:
+    """Return the gradient (H, W, ...) of the only picture."""
+    if plane is None:
+        return None
+    return plane[0]
+
+
+def _draw_set(
+    camera: _core.Camera | _core.Cameras,
+    settings: DrawSettings,
+    groups: Sequence[Sequence[torch.Tensor]],
+    *,
+    keep_tape: bool,
+) -> tuple[list[torch.Tensor | None], _core.Tape | _core.ViewsTape | None]:
+    """Return colour, alpha and depth of the pictures of one set, and the data for their
+    backward pass."""
+    *groups, backgrounds = ([tensor.detach() for tensor in group] for group in groups)
+    count = max(len(group) for group in groups)
+    rows = [
+        Gaussians(*(group[view % len(group)] for group in groups)).rows for view in range(count)
+    ]
+    drawn: _core.Rasterized | _core.RasterizedViews
+    if isinstance(camera, _core.Camera):
+        drawn = _core.rasterize(
+            rows[0],
+            camera,
+            filter_px2=settings.filter_px2,
+            antialiased=settings.antialiased,
+            background=backgrounds[0].tolist(),
+            with_depth=settings.with_depth,
+            keep_tape=keep_tape,
+            plain_colors=settings.plain_colors,
+        )
+    else:
+        drawn = _core.rasterize_views(
+            rows,
+            camera,
+            filter_px2=settings.filter_px2,
+            antialiased=settings.antialiased,
+            backgrounds=joined(backgrounds).tolist(),
+            with_depth=settings.with_depth,
+            keep_tape=keep_tape,
+            plain_colors=settings.plain_colors,
+        )
+    return _planes(drawn), drawn.tape
+
+
+def _planes(drawn: _core.Rasterized | _core.RasterizedViews) -> list[torch.Tensor | None]:
+    """Return colour, alpha and depth (C, H, W, ...) as tensors."""
     import torch
 
-    *arrays, background = (tensor.detach() for tensor in inputs)
-    drawn = _core.rasterize(
-        Gaussians(*arrays).rows,
-        camera,
-        filter_px2=settings.filter_px2,
-        antialiased=settings.antialiased,
-        background=background.tolist(),
-        with_depth=settings.with_depth,
-        keep_tape=keep_tape,
-        plain_colors=settings.plain_colors,
-    )
     planes: list[torch.Tensor | None] = []
     for plane in (drawn.color, drawn.alpha, drawn.depth):
         if plane is None:
             planes.append(None)
+        elif isinstance(drawn, _core.Rasterized):
+            planes.append(torch.as_tensor(plane).unsqueeze(0))
         else:
             planes.append(torch.as_tensor(plane))
-    return planes, drawn.tape
+    return planes
 
 
 def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) -> None:
@@ -229,8 +323,16 @@ def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) 
 
 def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch.Tensor:
     """Store and return the gradient with respect to the centres, given that of each
-    view. Also store the sums of absolute gradients, if requested."""
-    d_centers, *sizes = (joined(parts)[probe.pairs] for parts in zip(*gradients, strict=True))
+    set. Also store the sums of absolute gradients, if requested."""
+    import torch
+
+    of_centers: list[torch.Tensor] = []
+    for parts in zip(*gradients, strict=True):
+        whole = parts[0]
+        if len(parts) > 1:
+            whole = torch.cat(parts)
+        of_centers.append(whole[probe.pairs].view(probe.centers.shape))
+    d_centers, *sizes = of_centers
     probe.gradient.value = d_centers
     if probe.with_sizes:
         cast(Any, probe.centers).absgrad = sizes[0]
@@ -251,21 +353,22 @@ def _input_parts(gradients: _core.Gradients) -> list[Array]:
 
 
 def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
-    """Return the gradients with respect to the centres and, if requested, the sums of
-    absolute gradients."""
+    """Return the gradients (C, N, 2) with respect to the centres and, if requested, the
+    sums of absolute gradients."""
     import torch
 
     parts = (gradients.centers, gradients.center_sizes)
-    return [torch.as_tensor(part) for part in parts if part is not None]
+    tensors = [torch.as_tensor(part) for part in parts if part is not None]
+    return [tensor[(None,) * (3 - tensor.ndim)] for tensor in tensors]
 
 
 class _Context(Protocol):
     """The data that autograd stores between the forward and the backward pass."""
 
-    counts: list[int]
-    probe: CenterProbe | None
-    tapes: list[_core.Tape]
+    call: _Call
+    tapes: list[_core.Tape | _core.ViewsTape]
     devices: list[torch.device]
+    pose: tuple[torch.device, torch.dtype]
     needs_input_grad: tuple[bool, ...]
     saved_tensors: tuple[torch.Tensor, ...]
 
@@ -273,53 +376,105 @@ class _Context(Protocol):
     def set_materialize_grads(self, value: bool, /) -> None: ...
 
 
-def _forward(
-    ctx: _Context,
-    cameras: Sequence[_core.Camera],
-    settings: DrawSettings,
-    inputs: Sequence[torch.Tensor],
-    *,
-    keep_tape: bool,
-) -> tuple[torch.Tensor | None, ...]:
-    """Return the planes of the pictures of all cameras, one picture after another."""
+def _forward(ctx: _Context, inputs: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
+    """Return the planes of the pictures of all sets, one set after another."""
+    call = ctx.call
     pictures: list[torch.Tensor | None] = []
-    for view, camera in enumerate(cameras):
-        inputs_of_view = [inputs[slot] for slot in _slots_of_view(ctx.counts, view)]
-        planes, tape = _draw_view(camera, settings, inputs_of_view, keep_tape=keep_tape)
+    for number, camera in enumerate(call.views.cameras):
+        slots = call.slots_of_set(number)
+        groups = [[inputs[slot] for slot in slots_of_kind] for slots_of_kind in slots]
+        planes, tape = _draw_set(camera, call.settings, groups, keep_tape=call.keep_tape)
         if tape is not None:
             ctx.tapes.append(tape)
         pictures += planes
     # On a GPU, the backward pass reads the inputs again, so autograd must detect if
     # they were overwritten.
     if inputs[0].is_cuda:
-        ctx.save_for_backward(*inputs[: -ctx.counts[-1]], *pictures)
+        ctx.save_for_backward(*inputs[: -call.counts[-1]], *pictures)
     return tuple(pictures)
+
+
+def _gradients_of_set(
+    ctx: _Context, number: int, planes: Sequence[torch.Tensor | None], wants: Sequence[bool]
+) -> _core.Gradients:
+    """Run the backward pass of a set. `wants` contains whether gradients of the
+    centres, sums of their absolute values, and gradients of the poses are requested."""
+    tape = ctx.tapes[number]
+    d_color, d_alpha, d_depth = map(_to_core, planes)
+    if isinstance(tape, _core.Tape):
+        return _core.rasterize_backward(
+            tape, _alone(d_color), _alone(d_alpha), _alone(d_depth), wants[0], wants[1]
+        )
+    slots = ctx.call.slots_of_set(number)
+    return _core.rasterize_views_backward(
+        tape,
+        d_color,
+        d_alpha,
+        d_depth,
+        with_centers=wants[0],
+        with_sizes=wants[1],
+        with_poses=wants[2],
+        opacities_for_each_view=len(slots[3]) > 1,
+        sh_for_each_view=len(slots[4]) > 1,
+    )
 
 
 def _backward(
     ctx: _Context, gradients: Sequence[torch.Tensor | None]
 ) -> tuple[torch.Tensor | None, ...]:
-    """Return the gradients with respect to the centres and then to all inputs."""
+    """Return the gradients with respect to the centres, to the poses, and then to all
+    inputs."""
     import torch
 
     _ = ctx.saved_tensors  # raises an error if a saved tensor was overwritten
-    wants_centers, *wants_input = ctx.needs_input_grad[5:]
-    probe = ctx.probe
-    with_sizes = probe is not None and probe.with_sizes
+    wants_centers, wants_poses, *wants_input = ctx.needs_input_grad[1:]
+    probe = ctx.call.probe
+    wants = (wants_centers, probe is not None and probe.with_sizes, wants_poses)
     sums: list[torch.Tensor | None] = [None] * len(wants_input)
     center_gradients: list[list[torch.Tensor]] = []
-    for view, tape in enumerate(ctx.tapes):
-        d_color, d_alpha, d_depth = map(_to_core, gradients[3 * view : 3 * view + 3])
-        parts = _core.rasterize_backward(tape, d_color, d_alpha, d_depth, wants_centers, with_sizes)
+    poses: list[torch.Tensor] = []
+    for number in range(len(ctx.tapes)):
+        parts = _gradients_of_set(ctx, number, gradients[3 * number : 3 * number + 3], wants)
         center_gradients.append(_center_parts(parts))
-        slots = _slots_of_view(ctx.counts, view)
-        for slot, part in zip(slots, _input_parts(parts), strict=True):
-            if wants_input[slot]:
-                _add_to(sums, slot, torch.as_tensor(part).to(ctx.devices[slot]))
+        if wants_poses:
+            poses.append(torch.as_tensor(parts.poses))
+        slots = ctx.call.slots_of_set(number)
+        for slots_of_kind, part in zip(slots, _by_slot(parts, slots), strict=True):
+            for slot, gradient in zip(slots_of_kind, part, strict=True):
+                if wants_input[slot]:
+                    _add_to(sums, slot, gradient.to(ctx.devices[slot]))
     d_centers = None
     if wants_centers and probe is not None:
         d_centers = _set_probe(probe, center_gradients)
-    return d_centers, *sums
+    d_viewmats = None
+    if wants_poses:
+        device, dtype = ctx.pose
+        d_viewmats = torch.nn.functional.pad(torch.cat(poses), (0, 0, 0, 1)).to(device, dtype)
+    return d_centers, d_viewmats, *sums
+
+
+def _by_slot(
+    gradients: _core.Gradients, slots: Sequence[Sequence[int]]
+) -> list[Sequence[torch.Tensor]]:
+    """Return, for each kind of input, the gradients of the tensors in its slots."""
+    import torch
+
+    tensors = [torch.as_tensor(part) for part in _input_parts(gradients)]
+    kinds: list[Sequence[torch.Tensor]] = []
+    for tensor, slots_of_kind in zip(tensors[:-1], slots, strict=False):
+        if len(slots_of_kind) > 1:
+            kinds.append(tensor.unbind())
+        else:
+            kinds.append([tensor])
+    backgrounds = tensors[-1].view(-1, 3)
+    if len(slots[-1]) > 1:
+        kinds.append(backgrounds.unbind())
+    else:
+        total = backgrounds[0]
+        for background in backgrounds[1:]:
+            total = total + background
+        kinds.append([total])
+    return kinds
 
 
 @functools.cache
@@ -331,26 +486,24 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
         @staticmethod
         def forward(
             ctx: _Context,
-            cameras: Sequence[_core.Camera],
-            settings: DrawSettings,
-            keep_tape: bool,
-            counts: list[int],
-            probe: CenterProbe | None,
-            *tensors: torch.Tensor,
+            call: _Call,
+            centers: torch.Tensor | None,
+            viewmats: torch.Tensor | None,
+            *inputs: torch.Tensor,
         ) -> tuple[torch.Tensor | None, ...]:
-            # The first tensor, the centres, is only used in the backward pass.
-            inputs = tensors[1:]
+            # The centres and the poses are only used in the backward pass.
             ctx.set_materialize_grads(False)
-            ctx.counts = counts
-            ctx.probe = probe
+            ctx.call = call
             ctx.tapes = []
             ctx.devices = [tensor.device for tensor in inputs]
-            return _forward(ctx, cameras, settings, inputs, keep_tape=keep_tape)
+            if viewmats is not None:
+                ctx.pose = (viewmats.device, viewmats.dtype)
+            return _forward(ctx, inputs)
 
         @staticmethod
         def backward(
             ctx: _Context, *gradients: torch.Tensor | None
         ) -> tuple[torch.Tensor | None, ...]:
-            return None, None, None, None, None, *_backward(ctx, gradients)
+            return None, *_backward(ctx, gradients)
 
     return Rasterize.apply

@@ -3,16 +3,18 @@ of the asset."""
 
 import os
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import get_args
 
-from v3dg import _device
 from v3dg._device import Device
 from v3dg._numbers import check_type, one_of, real, refuse, whole
 from v3dg._progress import Progress
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, check_pinhole
-from v3dg.levels.refined import DROP, refined_bundle
+from v3dg.levels.refined import DROP, RefineRequest
+from v3dg.levels.refined_units import refined_bundle
 from v3dg.levels.viewpoints import SeenFrom
+from v3dg.levels.whole import devices_for
 from v3dg.opening import File
 
 _UNDISTORT = (
@@ -31,6 +33,7 @@ def refine_bundle(
     seed: int = 0,
     device: str | Device = "auto",
     progress: Progress = True,
+    folder: str | os.PathLike[str] | None = None,
 ) -> Bundle:
     """Return a copy of a bundle whose levels look more like its asset.
 
@@ -47,7 +50,9 @@ def refine_bundle(
 
     Args:
         bundle: A bundle of `build_bundle`, or the path of its file. The function needs
-            about six times the memory of the bundle.
+            about six times the memory of the bundle. A bundle of an asset with more
+            than 4,194,304 gaussians, or 2,097,152 of SH degree 3, is refined in units
+            of at most that size, and needs the memory of a unit; see `folder`.
         cameras: Cameras of the pictures, in a sequence or by name, such as those of the
             asset's photographs. Views from other places may get worse.
         seen_from: Where pictures are taken without cameras. "outside": from all around.
@@ -56,14 +61,19 @@ def refine_bundle(
             free place with something in it, as a room does; both if that place is open
             above, as a street is, or if more is seen from outside than its walls; else
             outside. The config of the result says which.
-        steps: Number of pictures that are compared. A GPU uses sixteen of them for each
-            optimisation step, so the number is rounded up.
+        steps: Number of pictures that are compared, for each unit. A GPU uses sixteen
+            of them for each optimisation step, so the number is rounded up.
         drop: Share of a level's visibility, 0 to 0.5, that may be lost by dropping its
             least visible gaussians; 0 keeps all. Every further refinement of a bundle
             drops gaussians again.
         seed: Seed of the pictures.
         device: The device that computes.
         progress: See `build_bundle`.
+        folder: Where the units of a large bundle are stored when they are finished. If
+            they are there already, from an interrupted call with the same arguments,
+            they are not refined again. The result reads its gaussians from there and
+            from the file of the bundle, which must be in a file. By default, units and
+            the result are in memory.
 
     Raises:
         TypeError: ``bundle`` is not a Bundle, or an element of ``cameras`` is not a
@@ -71,7 +81,8 @@ def refine_bundle(
         ValueError: ``steps``, ``drop`` or ``seed`` is out of range, or ``seen_from`` is
             inside or both and the asset surrounds no place.
         RuntimeError: The device is "cuda" and cannot be used.
-        KeyboardInterrupt: Ctrl-C was pressed; threads have stopped.
+        KeyboardInterrupt: Ctrl-C was pressed; threads have stopped, and finished units
+            are in the folder.
     """
     if isinstance(bundle, str | os.PathLike):
         bundle = Bundle.open(bundle)
@@ -88,14 +99,8 @@ def refine_bundle(
     steps = whole(steps, "steps", "at least 1 step", 1, 1_000_000)
     drop = real(drop, "drop", "a share from 0 to 0.5", 0, 0.5)
     seed = whole(seed, "seed", "a whole number from 0 to 2^58 - 1", 0, (1 << 58) - 1)
-    chosen_device = _device.resolve(device)
-    return refined_bundle(
-        bundle,
-        cameras=cameras,
-        seen_from=seen_from,
-        steps=steps,
-        drop=drop,
-        seed=seed,
-        device=chosen_device,
-        progress=progress,
-    )
+    request = RefineRequest(steps, drop, seed, seen_from, tuple(cameras))
+    units_folder = None
+    if folder is not None:
+        units_folder = Path(folder)
+    return refined_bundle(bundle, request, devices_for(device), progress, units_folder)

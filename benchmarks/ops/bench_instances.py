@@ -58,20 +58,17 @@ class Config:
     """Number of crops of a field, each of 64 x 36 px, that are compared with all
     gaussians."""
     repeats: int = 11
-    refine: int = 0
-    """Number of steps of a refinement to measure as well; 0 for none."""
+    bundle: Path | None = None
+    """Levels of that asset, a .v3dg file; by default the asset is built as a draft."""
     gsplat: bool = True
     output: str | None = None
 
 
 def main(config: Config) -> None:
-    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     with gpu.PeakMemory():  # records the memory of an idle process
         torch.zeros(1, device=gpu.DEVICE)
-    bundle = build_bundle(asset, progress=False, device=gpu.DEVICE, quality="draft")
-    result: dict[str, Any] = {"repeats": config.repeats, "refine": config.refine}
-    if config.refine > 0:
-        bundle = v3dg.refine_bundle(bundle, steps=config.refine, device=gpu.DEVICE, progress=False)
+    bundle = bundle_of(config)
+    result: dict[str, Any] = {"repeats": config.repeats, "config": bundle.config}
     judge = Judge()
     if config.layout is not None:
         scene, cameras = read_layout(config.layout, bundle)
@@ -80,6 +77,13 @@ def main(config: Config) -> None:
     result["fields"] = [field(bundle, count, config, judge) for count in config.fields]
     judge.close()
     record.write(config.output, result)
+
+
+def bundle_of(config: Config) -> v3dg.Bundle:
+    if config.bundle is not None:
+        return v3dg.Bundle.open(config.bundle)
+    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
+    return build_bundle(asset, progress=False, device=gpu.DEVICE, quality="draft")
 
 
 def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge) -> Row:

@@ -7,7 +7,7 @@ its picture.
 
 ASSETS is a folder as for `pairs`. Captured assets are drawn at full detail, and with
 levels at the default tolerance. Random gaussians are drawn at full detail. Instances of
-a layout are drawn with levels at two tolerances, and at full detail. The time of a
+a layout are drawn with levels at several tolerances; 0 is full detail. The time of a
 frame is the median of 25, from idle device to idle device with Python's overhead. Times
 of kernels are means over a dozen frames under torch's profiler. To compare two
 versions, run the study with each version in alternation on one machine; equal digests
@@ -41,7 +41,6 @@ Frame = tuple[str, Any, Camera, float | None]
 levels."""
 
 _WARM_UPS, _FRAMES, _PROFILED = 4, 25, 12
-_TOLERANCES = 9.4, 3.0
 
 
 @dataclass
@@ -56,6 +55,11 @@ class Config:
     """Folder with assets.json; by default no captured asset is measured."""
     names: tuple[str, ...] = ()
     """Names of assets in that folder."""
+    bundle: Path | None = None
+    """Levels of the layout's asset, a .v3dg file; by default the asset is built as a
+    draft."""
+    tolerances: tuple[float, ...] = (9.4, 3.0, 0.0)
+    """Tolerances of the layout's frames."""
     counts: tuple[int, ...] = (1_000_000, 4_000_000)
     """Numbers of random gaussians."""
     widths: tuple[int, ...] = (1920, 3840)
@@ -88,12 +92,9 @@ def frames(config: Config) -> Iterator[Frame]:
             config, subject.name, v3dg.Renderer(subject.gaussians), subject.cameras, None
         )
     if config.layout is not None:
-        asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
-        scene, views = read_layout(
-            config.layout, v3dg.build_bundle(asset, device="cuda", progress=False, quality="draft")
-        )
+        scene, views = read_layout(config.layout, _bundle_of(config))
         renderer = v3dg.Renderer(scene, device="cuda")
-        for tolerance in (*_TOLERANCES, 0.0):
+        for tolerance in config.tolerances:
             for number in config.cameras:
                 name = list(views)[number]
                 yield (
@@ -102,6 +103,13 @@ def frames(config: Config) -> Iterator[Frame]:
                     views[name],
                     tolerance,
                 )
+
+
+def _bundle_of(config: Config) -> v3dg.Bundle:
+    if config.bundle is not None:
+        return v3dg.Bundle.open(config.bundle)
+    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
+    return v3dg.build_bundle(asset, device="cuda", progress=False, quality="draft")
 
 
 def _sized(

@@ -20,6 +20,8 @@ from v3dg import Bundle, Camera, Renderer, Scene
 # separately.
 _FIRST_FRAMES = 50
 _NUM_WORST = 10
+# A frame is compared with the median of this many frames around it.
+_NUM_NEIGHBOURS = 101
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -120,6 +122,7 @@ def measure(renderer: Renderer, views: list[Camera], options: dict[str, float]) 
     worst = _FIRST_FRAMES + np.argsort(-milliseconds[later])[:_NUM_WORST]
     return {
         **percentiles(milliseconds[later]),
+        "of_neighbours": percentiles(of_neighbours(milliseconds[later])),
         "drawn_again": int((draws[later] > 1).sum()),
         "drawn_again_ms": [round(float(ms), 3) for ms in milliseconds[later][draws[later] > 1]][
             :_NUM_WORST
@@ -138,8 +141,21 @@ def measure(renderer: Renderer, views: list[Camera], options: dict[str, float]) 
     }
 
 
+def of_neighbours(milliseconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return each frame's time over the median of the frames around it.
+
+    The number of gaussians changes along a flight, and the time of a frame with it.
+    The ratio leaves that out: it says how much longer than its neighbours a frame
+    takes.
+    """
+    window = min(_NUM_NEIGHBOURS, len(milliseconds) // 2 * 2 - 1)
+    padded = np.pad(milliseconds, window // 2, mode="reflect")
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(padded, window), axis=1)
+    return milliseconds / medians
+
+
 def percentiles(milliseconds: NDArray[np.float64]) -> dict[str, float]:
-    shares = {"p50": 50, "p95": 95, "p99": 99, "worst_ms": 100}
+    shares = {"p50": 50, "p95": 95, "p99": 99, "most": 100}
     values = np.percentile(milliseconds, list(shares.values()))
     result = {name: round(float(value), 3) for name, value in zip(shares, values, strict=True)}
     return result | {"p99_of_median": round(result["p99"] / result["p50"], 3)}

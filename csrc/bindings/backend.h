@@ -49,6 +49,7 @@
 #include "bindings/drawing.h"
 #include "bindings/tape.h"
 #include "bindings/types.h"
+#include "bindings/views.h"
 #include "cluster/box.h"
 #include "cluster/cluster.h"
 #include "draw/request.h"
@@ -325,6 +326,12 @@ class Backend {
     // keeps the gaussians alive.
     virtual Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera,
                                  const DrawLook& look, bool with_depth, bool keep_tape) const = 0;
+    // Draws gaussians without levels for several pinholes of one size, whose arrays are
+    // on the host. `gaussians` are those of all views, or of each view. Otherwise like
+    // rasterize().
+    virtual RasterizedViews rasterize_views(const std::vector<Rows>& gaussians,
+                                            const BoundCameras& cameras, const ViewsLook& look,
+                                            bool with_depth, bool keep_tape) const = 0;
 };
 
 // Returns the backend of a device. Throws RuntimeError if it was not compiled.

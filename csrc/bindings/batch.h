@@ -44,6 +44,8 @@ class BoundCameras {
     bool are_environments_long() const { return are_environments_long_; }
     // The cameras if some have lens distortion; otherwise empty.
     const std::vector<Camera>& lenses() const { return lenses_; }
+    // Returns the cameras. Their arrays must be on the host.
+    std::vector<Camera> on_host() const;
 
   private:
     py::object viewmats_object_, intrinsics_object_, environments_object_;

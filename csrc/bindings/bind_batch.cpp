@@ -84,6 +84,19 @@ BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int hei
             span_on<const int32_t>(device_, environments_object_, "environments", {count}).data;
 }
 
+std::vector<Camera> BoundCameras::on_host() const {
+    if (!lenses_.empty()) return lenses_;
+    const auto* viewmats = static_cast<const double*>(viewmats_.data);
+    const auto* intrinsics = static_cast<const double*>(intrinsics_.data);
+    const size_t stride = shares_intrinsics_ ? 0 : 9;
+    std::vector<Camera> cameras;
+    cameras.reserve(size_);
+    for (size_t b = 0; b < size_; ++b)
+        cameras.push_back(
+            camera_of(viewmats + 16 * b, intrinsics + stride * b, width_, height_, near_depth_));
+    return cameras;
+}
+
 BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth)
     : color_(std::move(color)),
       alpha_(std::move(alpha)),

@@ -173,8 +173,8 @@ void refine_cuts_arrays(const FitConfig& config, const CutComparison& comparison
     const CutRows levels{gaussians.write(), span_of<const float>(radius, "radius", {count})};
     pictures.check_all(gaussians);
     for (const float radius_of_one : levels.radius)
-        if (!(radius_of_one > 0))
-            throw py::value_error("radius: expected positive numbers, got " +
+        if (!(radius_of_one >= 0))
+            throw py::value_error("radius: expected numbers of at least 0, got " +
                                   std::to_string(radius_of_one));
     const Work work(gaussians.device());
     const Unlocked unlocked;

@@ -101,6 +101,9 @@ void bind_rasterize(py::module_& m) {
         .def_readonly("opacities", &Gradients::opacities)
         .def_readonly("sh", &Gradients::sh)
         .def_readonly("background", &Gradients::background)
+        .def_readonly("poses", &Gradients::poses,
+                      "(V, 3, 4), with respect to the world-to-camera matrices of V views, or "
+                      "None.")
         .def_readonly("centers", &Gradients::centers,
                       "(N, 2), by the centres on the image, or None.")
         .def_readonly(

@@ -279,6 +279,11 @@ class CudaBackend final : public Backend {
                          bool with_depth, bool keep_tape) const override {
         return cuda::rasterize(gaussians, camera, look, with_depth, keep_tape);
     }
+    RasterizedViews rasterize_views(const std::vector<Rows>& gaussians, const BoundCameras& cameras,
+                                    const ViewsLook& look, bool with_depth,
+                                    bool keep_tape) const override {
+        return cuda::rasterize_views(gaussians, cameras, look, with_depth, keep_tape);
+    }
 };
 
 }  // namespace

@@ -16,7 +16,7 @@ namespace {
 
 // A scene on the host. It has no data, because selection reads the arrays of
 // SceneState.
-class HostScene final : public backend::Scene {
+class HostBackendScene final : public backend::Scene {
   public:
     void set_bundles(const SceneState&, const Work&) override {}
     void set_instances(SceneState& state, const Work&) override { read_poses(state); }
@@ -154,7 +154,7 @@ class HostBackend final : public Backend {
         return std::make_shared<HostPalette>(table, sh);
     }
     std::unique_ptr<backend::Scene> make_scene(const Work&) const override {
-        return std::make_unique<HostScene>();
+        return std::make_unique<HostBackendScene>();
     }
     PoolDemands pool_demands(int max_sh_degree) const override {
         // The host uses 32-bit indices for SH codes, separately for each degree.
@@ -185,6 +185,11 @@ class HostBackend final : public Backend {
     Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                          bool with_depth, bool keep_tape) const override {
         return host::rasterize(gaussians, camera, look, with_depth, keep_tape);
+    }
+    RasterizedViews rasterize_views(const std::vector<Rows>& gaussians, const BoundCameras& cameras,
+                                    const ViewsLook& look, bool with_depth,
+                                    bool keep_tape) const override {
+        return host::rasterize_views(gaussians, cameras, look, with_depth, keep_tape);
     }
 };
 

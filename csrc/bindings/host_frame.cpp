@@ -7,7 +7,6 @@
 #include <cstring>
 
 #include "base/mutex.h"
-#include "camera/camera_arrays.h"
 #include "residency/host_pages.h"
 
 namespace v3dg::host {
@@ -149,20 +148,6 @@ class DrawnBatch final : public BoundBatch {
     const BatchStats stats_;
 };
 
-// Returns the cameras of arrays on the host. The arrays are float64.
-std::vector<Camera> cameras_of(const BoundCameras& arrays) {
-    if (!arrays.lenses().empty()) return arrays.lenses();
-    const auto* viewmats = static_cast<const double*>(arrays.viewmats().data);
-    const auto* intrinsics = static_cast<const double*>(arrays.intrinsics().data);
-    const size_t stride = arrays.shares_intrinsics() ? 0 : 9;
-    std::vector<Camera> cameras;
-    cameras.reserve(arrays.size());
-    for (size_t b = 0; b < arrays.size(); ++b)
-        cameras.push_back(camera_of(viewmats + 16 * b, intrinsics + stride * b, arrays.width(),
-                                    arrays.height(), arrays.near_depth()));
-    return cameras;
-}
-
 template <class T>
 Picture<T> picture_in(NewPicture& made, const Window& window, const Shade& shade) {
     const NewPlanes<T> planes = made.allocate<T>(kHost);
@@ -246,7 +231,7 @@ class HostFrame final : public backend::Frame {
         std::vector<SceneFrameCounts> counts(cameras.size());
         {
             const Unlocked unlocked;
-            const std::vector<Camera> camera = cameras_of(cameras);
+            const std::vector<Camera> camera = cameras.on_host();
             std::vector<int32_t> environment(cameras.size(), kSeesAll);
             const auto* given = static_cast<const int32_t*>(cameras.environments());
             if (given != nullptr) environment.assign(given, given + cameras.size());

@@ -86,6 +86,7 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_pool(m);
     v3dg::bind_sensor(m);
     v3dg::bind_batch(m);
+    v3dg::bind_views(m);
     v3dg::bind_frame(m);
     v3dg::bind_rays(m);
     v3dg::bind_fit_level(m);

@@ -20,6 +20,7 @@ void bind_scene(pybind11::module_& m);
 void bind_pool(pybind11::module_& m);
 void bind_sensor(pybind11::module_& m);
 void bind_batch(pybind11::module_& m);
+void bind_views(pybind11::module_& m);
 void bind_frame(pybind11::module_& m);
 void bind_rays(pybind11::module_& m);
 void bind_fit_level(pybind11::module_& m);

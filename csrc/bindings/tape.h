@@ -20,6 +20,7 @@ struct Gradients {
     py::object means, quats, scales, opacities, sh, background;
     py::object centers = py::none();       // (N, 2) with respect to the centres, 1 / px
     py::object center_sizes = py::none();  // (N, 2) sums of absolute values over pixels
+    py::object poses = py::none();         // (V, 3, 4) with respect to the poses of V views
 };
 
 // The results of rasterize() that its backward pass needs.
@@ -65,9 +66,15 @@ struct GradientPlane {
     GradientPlane(const py::object& given, const char* name, Device device,
                   const std::vector<py::ssize_t>& shape)
         : object(given.is_none() ? zeros(device, shape) : given) {
-        span = shape.size() == 3
-                   ? span_on<const T>(device, object, name, {shape[0], shape[1], shape[2]})
-                   : span_on<const T>(device, object, name, {shape[0], shape[1]});
+        switch (shape.size()) {
+            case 2: span = span_on<const T>(device, object, name, {shape[0], shape[1]}); break;
+            case 3:
+                span = span_on<const T>(device, object, name, {shape[0], shape[1], shape[2]});
+                break;
+            default:
+                span = span_on<const T>(device, object, name,
+                                        {shape[0], shape[1], shape[2], shape[3]});
+        }
     }
 
   private:

@@ -366,7 +366,7 @@ const FrameCounters& Drawing::settle() {
         check(cudaEventSynchronize(keeps_tape ? slot_->counted : slot_->done), "a frame");
         is_settled_ = was_drawn();
         if (is_settled_) break;
-        frame_.enlarge(*slot_->counters);
+        enlarge_frame();
         std::optional<StreamLock> lock;
         if (batch_.guards_models != nullptr) lock.emplace(*batch_.guards_models, stream_);
         frame_.enqueue(*this, {});
@@ -377,8 +377,14 @@ const FrameCounters& Drawing::settle() {
 
 bool Drawing::finish_or_enlarge() {
     wait();
-    if (!was_drawn()) frame_.enlarge(*slot_->counters);
+    if (!was_drawn()) enlarge_frame();
     return was_drawn();
+}
+
+void Drawing::enlarge_frame() {
+    // The next frame must not throw again for the counts of this one.
+    std::erase(frame_.unchecked_, slot_);
+    frame_.enlarge(*slot_->counters);
 }
 
 FrameTimes Drawing::times() const {

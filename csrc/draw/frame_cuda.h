@@ -195,6 +195,8 @@ class Drawing {
     friend class Frame;
     Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, cudaStream_t stream);
     bool was_drawn() const;
+    // Enlarges the buffers of the frame that were too small.
+    void enlarge_frame();
 
     Frame& frame_;
     FrameBatch batch_;

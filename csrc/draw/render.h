@@ -8,6 +8,7 @@
 #include "frame/image.h"
 #include "frame/record.h"
 #include "frame/sensor.h"
+#include "project/pose_gradient.h"
 #include "tile_bin/tile_bin.h"
 
 namespace v3dg {
@@ -74,13 +75,19 @@ struct Pick {
 bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera, int x, int y,
           Pick& picked);
 
+// The sums over views to which render_backward() adds.
+struct ViewSums {
+    PoseSums<double>* pose;  // of this view alone, zero initially; may be null
+};
+
 // Computes the gradients of the gaussians of a single draw. `workspace` must be the
-// workspace of the picture's render() call. Gradients are overwritten, not accumulated.
-// `out` and `centers` do not change for gaussians without a record.
+// workspace of the picture's render() call. Gradients are overwritten; with `sums`,
+// they are added to `out` instead. `out` and `centers` do not change for gaussians
+// without a record.
 template <class T>
 void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& workspace,
                      const GaussianRows<T>& out, const CenterGradients<T>& centers,
-                     T d_background[3]);
+                     T d_background[3], const ViewSums* sums = nullptr);
 
 }  // namespace v3dg

@@ -362,7 +362,7 @@ template <class T>
 void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& ws,
                      const GaussianRows<T>& out, const CenterGradients<T>& centers,
-                     T d_background[3]) {
+                     T d_background[3], const ViewSums* sums) {
     const TileGrid grid(picture.window);
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
@@ -409,6 +409,8 @@ void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Pic
     for (size_t t = 0; t < grid.size(); ++t)
         for (int c = 0; c < 3; ++c) d_background[c] += d_background_of_tile[3 * t + c];
 
+    const bool with_pose = sums != nullptr && sums->pose != nullptr;
+    std::vector<PoseSums<double>> pose_of_chunk(with_pose ? ws.num_chunks : 0);
     parallel_for(ws.num_chunks, 1, [&](size_t c) {
         const uint64_t first = ws.chunk_first.data()[c];
         const uint32_t count = ws.chunk_count.data()[c];
@@ -428,9 +430,15 @@ void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Pic
                 centers.sum[2 * static_cast<size_t>(gaussian) + 1] = d_records[i].ellipse.v;
             }
         }
-        V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(),
-                          count, camera, out);
+        if (sums == nullptr)
+            V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(),
+                              count, camera, out);
+        else
+            V3DG_DISPATCH_ISA(add_project_backward<T>, draw, ws.source.data() + first,
+                              d_records.data(), count, camera, out,
+                              with_pose ? &pose_of_chunk[c] : nullptr);
     });
+    for (const PoseSums<double>& part : pose_of_chunk) add(part, *sums->pose);
 }
 
 bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera, int x, int y,
@@ -461,7 +469,8 @@ bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera
                                     const std::atomic<bool>*, const DrawnSensor*);            \
     template void render_backward<T>(const Draw<T>&, const Intrinsics<T>&, const Picture<T>&, \
                                      const PictureGradient<T>&, const Workspace<T>&,          \
-                                     const GaussianRows<T>&, const CenterGradients<T>&, T*);
+                                     const GaussianRows<T>&, const CenterGradients<T>&, T*,   \
+                                     const ViewSums*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

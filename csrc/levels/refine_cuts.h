@@ -11,7 +11,9 @@ namespace v3dg {
 // The gaussians of all levels of a bundle.
 struct CutRows {
     GaussianRows<float> rows;
-    Span<const float> radius;  // largest scale of each gaussian
+    // The length that steps of each gaussian's position are relative to. A gaussian with
+    // radius 0 does not move.
+    Span<const float> radius;
 };
 
 // The settings of the comparison of pictures in a refinement.

@@ -346,7 +346,7 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison, const
         }
         const FitStep step = fit_step(config, static_cast<int>(i));
         sum.move_shown([&](size_t g, const GaussianRows<const float>& gradient, int num_windows) {
-            if (g < target_count) return;
+            if (g < target_count || levels.radius[g] == 0) return;
             move_gaussian(rows, g, gradient, g, levels.radius[g],
                           step_of_windows(step, num_windows), config.beta2, adam_moments);
         });

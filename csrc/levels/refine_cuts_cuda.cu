@@ -122,7 +122,7 @@ class StepFrame {
                            {.images = tables->image,
                             .d_pictures = tables->slope,
                             .num_tiles = windows.num_tiles()},
-                           slots, stream_);
+                           slots, nullptr, nullptr, stream_);
         project_backward({.item_records = tape.item_records,
                           .records = tape.lists.records,
                           .source = tape.source,

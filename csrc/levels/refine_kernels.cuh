@@ -180,7 +180,7 @@ __global__ void __launch_bounds__(kItemSize)
                 FitStep step, float beta2, Moments moments) {
     const size_t c = first_cluster + blockIdx.x, i = size_t(blockIdx.y) * kItemSize + threadIdx.x,
                  row = static_cast<size_t>(offset[c]) + i;
-    if (row >= static_cast<size_t>(offset[c + 1])) return;
+    if (row >= static_cast<size_t>(offset[c + 1]) || radius[row] == 0) return;
     size_t sum = 0;
     int num_windows = 0;
     shown.for_each_window(c, i, [&](unsigned, size_t of_window) {

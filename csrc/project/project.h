@@ -11,6 +11,7 @@
 #include "frame/draw_list.h"
 #include "frame/image.h"
 #include "frame/record.h"
+#include "project/pose_gradient.h"
 #include "project/project_math.h"
 
 namespace v3dg {
@@ -52,5 +53,10 @@ V3DG_DECLARE_PER_ISA(template <class T>
                      void project_backward(const Draw<T>& draw, const uint32_t* source,
                                            const RecordGradient<T>* d_records, size_t count,
                                            const Intrinsics<T>& camera, const GaussianRows<T>& out))
+// Like project_backward(), but adds to `out`. Unless `pose` is null, it also adds the
+// terms of the gradient of the camera's pose.
+V3DG_DECLARE_PER_ISA(template <class T> void add_project_backward(
+    const Draw<T>& draw, const uint32_t* source, const RecordGradient<T>* d_records, size_t count,
+    const Intrinsics<T>& camera, const GaussianRows<T>& out, PoseSums<double>* pose))
 
 }  // namespace v3dg

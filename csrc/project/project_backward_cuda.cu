@@ -7,6 +7,7 @@
 #include "base/scan.cuh"
 #include "project/project_backward.h"
 #include "project/project_math.h"
+#include "project/slot_sums.cuh"
 
 namespace v3dg {
 namespace cuda {
@@ -14,54 +15,8 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = kItemSize;
-// One thread sums up to this many slots of a record; a warp sums more.
-constexpr uint32_t kFewSlots = 16;
 // SH words that a thread loads before it stores any of them
 constexpr int kWordsAtOnce = 6;
-
-template <class Value>
-__device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
-    static_assert(sizeof sum % sizeof(float2) == 0, "values are loaded as pairs of floats");
-    Value slot;
-    for (size_t k = 0; k < sizeof sum / sizeof(float2); ++k)
-        reinterpret_cast<float2*>(&slot)[k] = reinterpret_cast<const float2*>(of_slot + i)[k];
-    sum += slot;
-}
-
-// Sums `num` slots in a fixed order, so that the bits of the result are reproducible.
-// All lanes of the warp must call it. Returns whether any slot was written.
-template <class Value>
-__device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first,
-                             uint32_t num, Value& sum) {
-    const int lane = threadIdx.x % 32;
-    uint32_t touched = 0;
-    if (num <= kFewSlots) {
-        for (uint32_t i = 0; i < num; ++i)
-            touched |= static_cast<uint32_t>(slots.is_touched[first + i]) << i;
-        for (uint32_t todo = touched; todo != 0; todo &= todo - 1)
-            add_slot(of_slot, first + __ffs(todo) - 1, sum);
-    }
-    for (unsigned many = __ballot_sync(kAllLanes, num > kFewSlots); many != 0; many &= many - 1) {
-        const int owner = __ffs(many) - 1;
-        const uint32_t begin = __shfl_sync(kAllLanes, first, owner),
-                       end = begin + __shfl_sync(kAllLanes, num, owner);
-        Value part{};
-        bool part_touched = false;
-        for (uint32_t i = begin + lane; i < end; i += 32)
-            if (slots.is_touched[i] != 0) {
-                add_slot(of_slot, i, part);
-                part_touched = true;
-            }
-        float* value = reinterpret_cast<float*>(&part);
-        for (size_t k = 0; k < sizeof part / sizeof(float); ++k) value[k] = warp_sum(value[k]);
-        part_touched = __any_sync(kAllLanes, part_touched) != 0;
-        if (lane == owner) {
-            sum = part;
-            touched = part_touched;
-        }
-    }
-    return touched != 0;
-}
 
 __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
                                    const RecordBox* boxes, uint32_t* first_slot) {
@@ -91,17 +46,6 @@ __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
         if (is_record) first_slot[record] = first_of_item + sum_of_warp[warp] + end - num;
         __syncthreads();
     }
-}
-
-template <int kWidth>
-__device__ void load_row(const float* rows, uint64_t i, float (&row)[kWidth]) {
-#pragma unroll
-    for (int k = 0; k < kWidth; ++k) row[k] = rows[kWidth * i + k];
-}
-template <int kWidth>
-__device__ void store_row(float* rows, uint64_t i, const float* row) {
-#pragma unroll
-    for (int k = 0; k < kWidth; ++k) rows[kWidth * i + k] = row[k];
 }
 
 // The layout of a row of SH coefficients in shared memory. The stride is odd, which

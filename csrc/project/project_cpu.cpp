@@ -142,12 +142,34 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrins
     });
 }
 
+// What the backward pass does with gradients: it stores them, or adds them to sums over
+// views, without or with those of the pose.
+enum class Backward { stores, adds, adds_with_pose };
+
+template <Backward kWhat, class T>
+static void put(T value, T& out) {
+    if constexpr (kWhat == Backward::stores)
+        out = value;
+    else
+        out += value;
+}
+
+template <class V, class T>
+static void add_lanes(const PoseSums<V>& d, size_t lanes, PoseSums<T>& sums) {
+    for (size_t i = 0; i < lanes; ++i) {
+        for (int k = 0; k < 9; ++k) sums.linear[k] += d.linear[k][i];
+        for (int k = 0; k < 3; ++k) sums.shift[k] += d.shift[k][i];
+        for (int k = 0; k < 3; ++k) sums.direction[k] += d.direction[k][i];
+    }
+}
+
 // Fill the lanes one by one, because the gaussians of adjacent records are scattered in
 // memory. Filling costs little compared to the arithmetic.
-template <class T, ProjectingModel C>
-static void project_backward_by(const C& camera, const Draw<T>& draw, const uint32_t* source,
+template <Backward kWhat, class T, ProjectingModel C>
+static void project_backward_by(const C& model, const Draw<T>& draw, const uint32_t* source,
                                 const RecordGradient<T>* d_records, size_t count,
-                                const GaussianRows<T>& out) {
+                                const GaussianRows<T>& out, PoseSums<double>* pose) {
+    constexpr bool kWithPose = kWhat == Backward::adds_with_pose;
     using V = Vec<T>;
     constexpr size_t kWidth = kLanes<T>;
     const GaussianPlanes<T>& m = *draw.model;
@@ -178,7 +200,9 @@ static void project_backward_by(const C& camera, const Draw<T>& draw, const uint
             d.depth[i] = r.ellipse.depth;
             for (int c = 0; c < 3; ++c) d_color[c][i] = r.color[c];
         }
-        Projection<V, C> s;
+        V d_point[3], d_axes[9], d_direction[3] = {};
+        const auto camera = probed<kWithPose>(model, d_point, d_axes);
+        Projection<V, std::remove_const_t<decltype(camera)>> s;
         to_view(draw.view, g.mean, s.p);
         const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
                                               draw.appearance.antialiased, s);
@@ -187,14 +211,21 @@ static void project_backward_by(const C& camera, const Draw<T>& draw, const uint
         color_of_sh(m.sh_degree, direction, sh, color);
         Gaussian3d<V> d_g = project_gaussian_vjp(g, draw.view, camera, draw.appearance.filter_px2,
                                                  draw.appearance.antialiased, s, e, d);
-        color_of_sh_vjp(m.sh_degree, direction, sh, color, d_color, d_g.mean, d_sh);
+        color_of_sh_vjp(m.sh_degree, direction, sh, color, d_color,
+                        kWithPose ? d_direction : d_g.mean, d_sh);
+        if constexpr (kWithPose) {
+            for (int k = 0; k < 3; ++k) d_g.mean[k] += d_direction[k];
+            PoseSums<V> d_pose;
+            pose_vjp(g, draw.view, d_point, d_axes, d_direction, d_pose);
+            add_lanes(d_pose, lanes, *pose);
+        }
         for (size_t i = 0; i < lanes; ++i) {
             const uint64_t at = source[done + i];
-            for (int k = 0; k < 3; ++k) out.means[3 * at + k] = d_g.mean[k][i];
-            for (int k = 0; k < 4; ++k) out.quats[4 * at + k] = d_g.quat[k][i];
-            for (int k = 0; k < 3; ++k) out.scales[3 * at + k] = d_g.scale[k][i];
-            out.opacities[at] = d_g.opacity[i];
-            for (int k = 0; k < num_sh; ++k) out.sh[num_sh * at + k] = d_sh[k][i];
+            for (int k = 0; k < 3; ++k) put<kWhat>(d_g.mean[k][i], out.means[3 * at + k]);
+            for (int k = 0; k < 4; ++k) put<kWhat>(d_g.quat[k][i], out.quats[4 * at + k]);
+            for (int k = 0; k < 3; ++k) put<kWhat>(d_g.scale[k][i], out.scales[3 * at + k]);
+            put<kWhat>(d_g.opacity[i], out.opacities[at]);
+            for (int k = 0; k < num_sh; ++k) put<kWhat>(d_sh[k][i], out.sh[num_sh * at + k]);
         }
     }
 }
@@ -204,16 +235,33 @@ void project_backward(const Draw<T>& draw, const uint32_t* source,
                       const RecordGradient<T>* d_records, size_t count, const Intrinsics<T>& camera,
                       const GaussianRows<T>& out) {
     camera.visit([&](const auto& model) {
-        project_backward_by(model, draw, source, d_records, count, out);
+        project_backward_by<Backward::stores>(model, draw, source, d_records, count, out, nullptr);
     });
 }
 
-#define V3DG_INSTANTIATE(T)                                                                      \
-    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Intrinsics<T>&,         \
-                               const Window&, Record<T>*, uint32_t*, uint32_t, Reach&,           \
-                               const NextRun<T>&);                                               \
-    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, \
-                                      size_t, const Intrinsics<T>&, const GaussianRows<T>&);
+template <class T>
+void add_project_backward(const Draw<T>& draw, const uint32_t* source,
+                          const RecordGradient<T>* d_records, size_t count,
+                          const Intrinsics<T>& camera, const GaussianRows<T>& out,
+                          PoseSums<double>* pose) {
+    camera.visit([&](const auto& model) {
+        if (pose == nullptr)
+            project_backward_by<Backward::adds>(model, draw, source, d_records, count, out, pose);
+        else
+            project_backward_by<Backward::adds_with_pose>(model, draw, source, d_records, count,
+                                                          out, pose);
+    });
+}
+
+#define V3DG_INSTANTIATE(T)                                                                       \
+    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Intrinsics<T>&,          \
+                               const Window&, Record<T>*, uint32_t*, uint32_t, Reach&,            \
+                               const NextRun<T>&);                                                \
+    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*,  \
+                                      size_t, const Intrinsics<T>&, const GaussianRows<T>&);      \
+    template void add_project_backward<T>(const Draw<T>&, const uint32_t*,                        \
+                                          const RecordGradient<T>*, size_t, const Intrinsics<T>&, \
+                                          const GaussianRows<T>&, PoseSums<double>*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

@@ -67,21 +67,25 @@ struct RasterizeBackwardInput {
     PictureGradient<float> d_picture;
 };
 
-// Several pictures without depth.
+// Several pictures.
 struct PictureBatch {
     const FrameImage* images;
     const PictureGradient<float>* d_pictures;
-    uint32_t num_tiles;  // total over all pictures
+    uint32_t num_tiles;       // total over all pictures
+    bool has_depth = false;   // whether all gradients have depth; otherwise none has
+    uint32_t num_images = 0;  // of the same size; only for gradients of backgrounds
 };
 
 // Computes the gradients of the slots and of the background (3) of one picture.
 // `d_background_of_tile` is scratch memory, (num_tiles, 3).
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
                         float* d_background_of_tile, float* d_background, Stream stream);
-// Computes the gradients of the slots of all pictures of a batch, without sizes.
-// Ignores the image and the gradient of `in`.
+// Computes the gradients of the slots of all pictures of a batch and, unless it is
+// null, of the backgrounds (num_images, 3). Ignores the image and the gradient of `in`.
+// `d_background_of_tile` is scratch memory, (num_tiles, 3), or null.
 void rasterize_backward(const RasterizeBackwardInput& in, const PictureBatch& batch,
-                        const GradientSlots& slots, Stream stream);
+                        const GradientSlots& slots, float* d_background_of_tile,
+                        float* d_background, Stream stream);
 
 }  // namespace cuda
 

@@ -287,7 +287,7 @@ __device__ const PictureGradient<float>& gradient_of(const RasterizeBackwardInpu
     return in.d_picture;
 }
 
-// One block per tile. `d_background_of_tile` is null for a batch.
+// One block per tile. `d_background_of_tile` may be null for a batch.
 template <bool kWithDepth, bool kWithSize, bool kIsBatch>
 __global__ void __launch_bounds__(kThreads, 2)
     rasterize_backward_kernel(RasterizeBackwardInput in, PictureBatch batch, GradientSlots slots,
@@ -324,7 +324,7 @@ __global__ void __launch_bounds__(kThreads, 2)
         s.record[kBatch].log2_opacity = -INFINITY;
     }
     __syncthreads();
-    if (!kIsBatch && threadIdx.x < 3) {
+    if ((!kIsBatch || d_background_of_tile != nullptr) && threadIdx.x < 3) {
         float sum = 0;
         for (int w = 0; w < kWarps; ++w) sum += s.d_background[w][threadIdx.x];
         d_background_of_tile[3 * tile + threadIdx.x] = sum;
@@ -381,14 +381,25 @@ void start(const RasterizeBackwardInput& in, const GradientSlots& slots,
            in, PictureBatch{}, slots, d_background_of_tile);
 }
 
+template <bool kWithDepth, bool kWithSize>
+void start_batch(const RasterizeBackwardInput& in, const PictureBatch& batch,
+                 const GradientSlots& slots, float* d_background_of_tile, cudaStream_t stream) {
+    launch("rasterize_backward_kernel", &rasterize_backward_kernel<kWithDepth, kWithSize, true>,
+           batch.num_tiles, kThreads, sizeof(Shared<kWithSize>), stream, in, batch, slots,
+           d_background_of_tile);
+}
+
 constexpr int kSumThreads = 256;
 
-// Adds up the gradients of the background of all tiles. One block per channel.
+// Adds up the gradients of the background of the tiles of each image. One block per
+// image and channel.
 __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
     __shared__ float of_warp[kSumThreads / 32];
+    const uint32_t image = blockIdx.x / 3, channel = blockIdx.x % 3;
+    const float* of_image = of_tile + 3 * static_cast<uint64_t>(num_tiles) * image;
     float sum = 0;
     for (uint32_t t = threadIdx.x; t < num_tiles; t += kSumThreads)
-        sum += of_tile[3 * t + blockIdx.x];
+        sum += of_image[3 * t + channel];
     sum = warp_sum(sum);
     if (threadIdx.x % 32 == 0) of_warp[threadIdx.x / 32] = sum;
     __syncthreads();
@@ -412,9 +423,16 @@ void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& s
 }
 
 void rasterize_backward(const RasterizeBackwardInput& in, const PictureBatch& batch,
-                        const GradientSlots& slots, cudaStream_t stream) {
-    launch("rasterize_backward_kernel", &rasterize_backward_kernel<false, false, true>,
-           batch.num_tiles, kThreads, sizeof(Shared<false>), stream, in, batch, slots, nullptr);
+                        const GradientSlots& slots, float* d_background_of_tile,
+                        float* d_background, cudaStream_t stream) {
+    const auto run = slots.size != nullptr
+                         ? batch.has_depth ? &start_batch<true, true> : &start_batch<false, true>
+                     : batch.has_depth ? &start_batch<true, false>
+                                       : &start_batch<false, false>;
+    run(in, batch, slots, d_background_of_tile, stream);
+    if (d_background == nullptr) return;
+    launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 3 * batch.num_images, kSumThreads, 0,
+           stream, d_background_of_tile, batch.num_tiles / batch.num_images, d_background);
 }
 
 }  // namespace cuda

@@ -23,9 +23,11 @@ from rooms import room
 from v3dg import BuildConfig, build_bundle
 from v3dg._device import CPU
 from v3dg.cli import build as command
+from v3dg.gaussians import gaussian_bytes
 from v3dg.levels import DraftWarning, build_file, levels_path
 from v3dg.levels.default_quality import chosen_quality
 from v3dg.levels.quality import refinement_of
+from v3dg.levels.refine_sizes import refine_bytes
 
 QUICK = BuildConfig(cluster_size=64, steps=0)
 STEPS = 12
@@ -78,19 +80,30 @@ def names_in(folder):
 
 
 @pytest.mark.parametrize(
-    ("quality", "num_gaussians", "steps"),
+    ("quality", "num_gaussians", "sh_degree", "steps"),
     [
-        ("standard", 1000, 18_010),
-        ("standard", 500_000, 23_000),
-        ("standard", 10_000_000, 100_000),
-        ("best", 500_000, 115_000),
-        ("best", 10_000_000, 500_000),
+        ("standard", 1000, 0, 18_010),
+        ("standard", 500_000, 3, 23_000),
+        ("standard", 4_000_000, 0, 58_000),
+        ("best", 500_000, 0, 115_000),
+        # Four units of 2.5 million, and eight of 1.25 million.
+        ("standard", 10_000_000, 0, 43_000),
+        ("standard", 10_000_000, 3, 30_500),
+        ("best", 10_000_000, 0, 215_000),
     ],
 )
-def test_large_assets_are_refined_by_more_pictures(quality, num_gaussians, steps):
-    refinement = refinement_of(quality, num_gaussians, 7)
-    assert (refinement.steps, refinement.seed) == (steps, 7)
-    assert refinement_of("draft", num_gaussians, 7) is None
+def test_large_assets_are_refined_by_more_pictures(quality, num_gaussians, sh_degree, steps):
+    request = refinement_of(quality, num_gaussians, sh_degree, 7)
+    assert (request.steps, request.seed) == (steps, 7)
+    assert refinement_of("draft", num_gaussians, sh_degree, 7) is None
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_the_memory_of_a_refinement_has_a_limit(sh_degree):
+    of_million = refine_bytes(1_000_000, sh_degree)
+    assert of_million == 12 * 1_000_000 * gaussian_bytes(sh_degree)
+    assert refine_bytes(100_000_000, sh_degree) < 10e9
+    assert refine_bytes(100_000_000, sh_degree) > of_million
 
 
 def test_a_build_of_a_quality_is_a_build_and_a_refinement(short, asset, device, tmp_path):
@@ -252,7 +265,8 @@ def test_an_asset_without_levels_is_built_once(short, file, device, tmp_path):
 
 
 def test_an_asset_that_is_too_large_to_be_refined_is_refused_before(file, tmp_path, monkeypatch):
-    monkeypatch.setattr("v3dg.levels.quality._COPIES", 1 << 20)
+    monkeypatch.setattr("v3dg.levels.refine_sizes._COPIES", 1 << 20)
+    monkeypatch.setattr("v3dg.levels.refine_sizes._UNIT_BYTES", 1 << 60)
     options = {"config": QUICK, "device": "cpu", "progress": False, "memory": "1GiB"}
     message = r"memory: expected at least [\d,]+ MiB to refine an asset of 1,000 gaussians, got"
     with pytest.raises(ValueError, match=message):
@@ -278,17 +292,18 @@ class SmallGpu:
         (BuildConfig(), True, 1000, 1 << 30, "standard"),
         (BuildConfig(), False, 1000, 1 << 30, "draft"),
         (QUICK, True, 1000, 1 << 30, "draft"),
-        (BuildConfig(), True, 4_000_001, 1 << 60, "4,000,001 gaussians take minutes"),
+        (BuildConfig(), True, 4_000_000, 1 << 40, "standard"),
+        (BuildConfig(), True, 100_000_000, 1 << 40, "standard"),
         (BuildConfig(), True, 100_000, 1 << 20, "100,000 gaussians takes .* MiB of the host"),
-        (BuildConfig(), True, 2_000_000, 1 << 40, "2,000,000 gaussians takes .* MiB of the GPU"),
+        (BuildConfig(), True, 4_100_000, 1 << 40, "4,100,000 gaussians takes .* MiB of the GPU"),
     ],
 )
 def test_a_build_is_refined_by_default_where_that_is_quick(
     monkeypatch, config, is_gpu, num_gaussians, memory, expected
 ):
-    """This holds on a GPU with enough memory. For large assets, the reason is printed
-    why they are not refined."""
-    monkeypatch.setattr("v3dg.levels.default_quality.free_on", lambda _: 1 << 30)
+    """This holds on a GPU with enough memory, of which an asset in units needs no more
+    than a unit does. Otherwise the reason is printed."""
+    monkeypatch.setattr("v3dg.levels.default_quality.free_on", lambda _: 2_700_000_000)
     device = SmallGpu() if is_gpu else CPU
     leaves = SimpleNamespace(num_gaussians=num_gaussians, sh_degree=0)
     if expected in ("standard", "draft"):
@@ -302,13 +317,13 @@ def test_a_build_is_refined_by_default_where_that_is_quick(
 
 def test_the_command_says_why_a_large_asset_stays_a_draft(file, tmp_path, monkeypatch, capsys):
     def choose(*_):
-        warnings.warn("quality: 5,000,000 gaussians take minutes", DraftWarning, stacklevel=1)
+        warnings.warn("quality: refining takes 1 MiB", DraftWarning, stacklevel=1)
         return "draft"
 
     monkeypatch.setattr("v3dg.levels.files.chosen_quality", choose)
     options = {"cluster_size": 64, "up": "z", "device": "cpu", "quiet": True}
     command.run(command.Build(assets=(file,), output=tmp_path / "a.v3dg", **options))
-    assert "quality: 5,000,000 gaussians take minutes" in capsys.readouterr().err
+    assert "quality: refining takes 1 MiB" in capsys.readouterr().err
 
 
 def test_viewpoints_of_a_draft_are_refused(asset):

@@ -176,6 +176,204 @@ def test_a_camera_alone_is_drawn_as_v3dg_draws_it(device):
     np.testing.assert_array_equal(alphas[0, ..., 0].cpu(), image.alpha.cpu())
 
 
+# Gradients of poses, and several sets of gaussians.
+
+
+class PosedCamera:
+    """A camera whose pose is a tensor, for the reference."""
+
+    def __init__(self, camera, viewmat):
+        self.viewmat = viewmat
+        self.position = -torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
+        for name in ("fx", "fy", "cx", "cy", "width", "height", "near"):
+            setattr(self, name, getattr(camera, name))
+
+
+def posed(cameras, viewmats):
+    return [PosedCamera(*pair) for pair in zip(cameras, viewmats, strict=True)]
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("render_mode", ["RGB", "D", "RGB+ED"])
+@pytest.mark.parametrize("sh_degree", [None, 3])
+def test_gradients_of_poses_are_those_of_autograd(render_mode, sh_degree, packed):
+    inputs = leaves(CAMERAS, plain=sh_degree is None)
+    antialiased = render_mode != "D"
+    rasterize_mode = "antialiased" if antialiased else "classic"
+    options = {"render_mode": render_mode, "sh_degree": sh_degree}
+    places = of_cameras(CAMERAS)
+    viewmats = places.pop("viewmats").requires_grad_()
+    *shape, colors, backgrounds = inputs
+    got = rasterization(
+        *shape,
+        colors,
+        viewmats,
+        **places,
+        backgrounds=backgrounds,
+        packed=packed,
+        rasterize_mode=rasterize_mode,
+        **options,
+    )[:2]
+    wanted = expected(inputs, posed(CAMERAS, viewmats), antialiased=antialiased, **options)
+    of_all = [viewmats, *inputs]
+    wanted_gradients = gradients(weighted_sum(*wanted), of_all)
+    assert (wanted_gradients[0].abs().amax((1, 2)) > 0).all()
+    for g, w in zip(gradients(weighted_sum(*got), of_all), wanted_gradients, strict=True):
+        assert_close(g.numpy(), w.numpy(), GRADIENT_DOUBLE)
+
+
+def test_gradients_of_poses_in_single_precision(device):
+    results = []
+    for dtype, where in ((torch.float64, "cpu"), (torch.float32, device)):
+        *shape, colors, backgrounds = leaves(CAMERAS, 200, dtype=dtype, device=where)
+        places = of_cameras(CAMERAS, dtype=dtype, device=where)
+        places["viewmats"].requires_grad_()
+        pictures, alphas, _ = rasterization(
+            *shape, colors, **places, backgrounds=backgrounds, sh_degree=3, render_mode="RGB+ED"
+        )
+        weighted_sum(pictures, alphas).backward()
+        assert places["viewmats"].grad.device == places["viewmats"].device
+        results.append([t.grad.cpu().double() for t in (places["viewmats"], *shape, colors)])
+    for double, single in zip(*results, strict=True):
+        assert_gradients_agree(single, double, GRADIENT_FLOAT)
+
+
+def test_a_pose_is_found_from_a_picture(device):
+    *shape, colors, _ = leaves([FIRST], 60, dtype=torch.float32, device=device)
+    places = of_cameras([FIRST], dtype=torch.float32, device=device)
+    fixed = {"Ks": places["Ks"], "width": 23, "height": 19, "sh_degree": 3}
+    tensors = [t.detach() for t in (*shape, colors)]
+    target = rasterization(*tensors, places["viewmats"], **fixed)[0]
+    shift = torch.tensor([0.05, -0.04, 0.06], device=device, requires_grad=True)
+    optimizer = torch.optim.Adam([shift], lr=4e-3)
+    first = shift.detach().norm()
+    for _ in range(60):
+        moved = torch.zeros(1, 4, 4, device=device)
+        moved[0, :3, 3] = shift
+        picture = rasterization(*tensors, places["viewmats"] + moved, **fixed)[0]
+        optimizer.zero_grad()
+        (picture - target).square().sum().backward()
+        optimizer.step()
+    assert shift.detach().norm() < 0.2 * first
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("clip", [{}, {"radius_clip": 2.0}], ids=["all", "clipped"])
+def test_cameras_together_give_the_bits_of_each_alone(device, packed, clip):
+    options = {"packed": packed, "absgrad": True, "sh_degree": 3, "render_mode": "RGB+ED", **clip}
+    inputs = leaves(CAMERAS, 600, dtype=torch.float32, device=device)
+    pictures, alphas, info = draw(inputs, CAMERAS, **options)
+    info["means2d"].retain_grad()
+    weights = [torch.rand_like(part) for part in (pictures, alphas)]
+    (pictures * weights[0]).sum().add((alphas * weights[1]).sum()).backward()
+    sums = None
+    rows = 0
+    for c, camera in enumerate(CAMERAS):
+        alone = [*(t.detach().requires_grad_() for t in inputs[:5]), inputs[5][c : c + 1].detach()]
+        picture, alpha, info_alone = draw(alone, [camera], **options)
+        assert torch.equal(pictures[c], picture[0])
+        assert torch.equal(alphas[c], alpha[0])
+        info_alone["means2d"].retain_grad()
+        loss = (picture[0] * weights[0][c]).sum() + (alpha[0] * weights[1][c]).sum()
+        loss.backward()
+        grads = [t.grad for t in alone[:5]]
+        sums = grads if sums is None else [a + b for a, b in zip(sums, grads, strict=True)]
+        of_camera = c
+        if packed:
+            of_camera = slice(rows, rows + len(info_alone["means2d"]))
+            rows = of_camera.stop
+        for name in ("grad", "absgrad"):
+            got = getattr(info["means2d"], name)[of_camera]
+            assert torch.equal(got, getattr(info_alone["means2d"], name).view(got.shape))
+    for name, t, wanted in zip(scenes.NAMES, inputs[:5], sums, strict=True):
+        if clip and name == "opacities":  # each camera has its own, which torch adds up
+            torch.testing.assert_close(t.grad, wanted)
+        else:
+            assert torch.equal(t.grad, wanted)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("for_each_camera", [False, True], ids=["shared", "for each"])
+def test_sets_of_gaussians_are_drawn_apart(device, packed, for_each_camera):
+    """Batch dimensions (2, 2): four sets with two cameras each."""
+    cameras = CAMERAS[:2]
+    sets = [
+        leaves(cameras, 40, sh_degree=1, dtype=torch.float32, device=device, seed=seed)
+        for seed in range(4)
+    ]
+    if for_each_camera:
+        for one in sets:
+            one[4] = torch.stack([one[4], 0.5 * one[4]]).detach().requires_grad_()
+    together = [
+        torch.stack([t.detach() for t in kind]).unflatten(0, (2, 2)).requires_grad_()
+        for kind in zip(*sets, strict=True)
+    ]
+    places = of_cameras(cameras, dtype=torch.float32, device=device)
+    viewmats = places["viewmats"].expand(2, 2, 2, 4, 4).clone().requires_grad_()
+    options = {"packed": packed, "sh_degree": 1, "radius_clip": 1.0}
+    pictures, alphas, info = rasterization(
+        *together[:5],
+        viewmats,
+        places["Ks"].expand(2, 2, 2, 3, 3),
+        places["width"],
+        places["height"],
+        backgrounds=together[5],
+        **options,
+    )
+    assert pictures.shape == (2, 2, 2, 19, 23, 3)
+    assert alphas.shape == (2, 2, 2, 19, 23, 1)
+    assert (info["n_batches"], info["n_cameras"]) == (4, 2)
+    weights = torch.rand_like(pictures)
+    found = torch.autograd.grad((pictures * weights).sum(), [viewmats, *together])
+    first = 0
+    for number, one in enumerate(sets):
+        at = divmod(number, 2)
+        places["viewmats"] = places["viewmats"].detach().requires_grad_()
+        picture, alpha, of_set = draw_set(one, places, options)
+        assert torch.equal(pictures[at], picture)
+        assert torch.equal(alphas[at], alpha)
+        alone = torch.autograd.grad((picture * weights[at]).sum(), [places["viewmats"], *one])
+        for g, w in zip(found, alone, strict=True):
+            assert torch.equal(g[at], w)
+        for name in ("means2d", "depths", "conics", "opacities", "radii"):
+            rows = info[name][at] if not packed else info[name][first : first + len(of_set[name])]
+            assert torch.equal(rows, of_set[name])
+        if packed:
+            ids = info["batch_ids"][first : first + len(of_set["depths"])]
+            assert (ids == number).all()
+            first += len(of_set["depths"])
+
+
+def draw_set(inputs, places, options):
+    *shape, colors, backgrounds = inputs
+    return rasterization(*shape, colors, **places, backgrounds=backgrounds, **options)
+
+
+@pytest.mark.gpu
+def test_cameras_that_are_drawn_in_parts_give_the_same():
+    cameras = [
+        scenes.camera(2048, 2048, fx=1500.0, pose=_near(seed)) for seed in range(3)
+    ]  # two of them fit into a part
+    inputs = leaves(cameras, 300, sh_degree=1, dtype=torch.float32, device="cuda")
+    places = of_cameras(cameras, dtype=torch.float32, device="cuda")
+    places["viewmats"].requires_grad_()
+    picture, _, _ = draw_set(inputs, places, {"sh_degree": 1})
+    found = torch.autograd.grad(picture.square().sum(), [places["viewmats"], *inputs[:5]])
+    sums = None
+    for c, camera in enumerate(cameras):
+        place = of_cameras([camera], dtype=torch.float32, device="cuda")
+        place["viewmats"].requires_grad_()
+        one = [*inputs[:5], inputs[5][c : c + 1]]
+        alone, _, _ = draw_set(one, place, {"sh_degree": 1})
+        assert torch.equal(picture[c], alone[0])
+        grads = torch.autograd.grad(alone.square().sum(), [place["viewmats"], *inputs[:5]])
+        assert torch.equal(found[0][c], grads[0][0])
+        of_inputs = list(grads[1:])
+        sums = of_inputs if sums is None else [a + b for a, b in zip(sums, of_inputs, strict=True)]
+    for g, w in zip(found[1:], sums, strict=True):
+        assert torch.equal(g, w)
+
+
 # The dict of intermediate values.
 
 
@@ -409,16 +607,6 @@ def test_what_asks_for_nothing_is_accepted():
     assert len(rasterization(*shape, colors, **of_cameras([FIRST]), sh_degree=3, **nothing)) == 3
 
 
-def test_cameras_are_not_trained():
-    *shape, colors, _ = leaves([FIRST])
-    places = of_cameras([FIRST])
-    places["viewmats"].requires_grad_()
-    with pytest.raises(
-        ValueError, match=r"viewmats: expected tensors without gradient, .* call \.detach\(\)"
-    ):
-        rasterization(*shape, colors, **places, sh_degree=3)
-
-
 def test_wrong_kinds_are_refused():
     *shape, colors, _ = leaves([FIRST])
     with pytest.raises(TypeError, match="quats: expected a torch tensor, got ndarray"):
@@ -430,6 +618,16 @@ def test_wrong_kinds_are_refused():
     places = of_cameras(CAMERAS[:2])
     places["Ks"] = places["Ks"][:1]
     with pytest.raises(ValueError, match=r"Ks: expected as many as viewmats \(2\), got 1"):
+        rasterization(*shape, colors, **places, sh_degree=3)
+    places = of_cameras(CAMERAS[:2])
+    places["viewmats"] = places["viewmats"][None]
+    with pytest.raises(ValueError, match=r"viewmats: expected shape \(C, 4, 4\), got \(1, 2, 4, 4"):
+        rasterization(*shape, colors, **places, sh_degree=3)
+    places = of_cameras(CAMERAS[:2])
+    with pytest.raises(ValueError, match=r"quats: expected the batch dimensions \(1,\) of means"):
+        rasterization(shape[0][None], *shape[1:], colors, **places, sh_degree=3)
+    places["viewmats"][1, 0, 0] = 2
+    with pytest.raises(ValueError, match="camera 1: expected a rotation"):
         rasterization(*shape, colors, **places, sh_degree=3)
     with pytest.raises(
         NotImplementedError, match="rasterization_2dgs: 2D gaussians are not supported"

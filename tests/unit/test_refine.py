@@ -543,6 +543,20 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows, win
         np.testing.assert_array_equal(getattr(moved, name)[~moves], values[~moves])
 
 
+def test_gaussians_of_radius_0_do_not_move(bundle, device):
+    config = replace(BuildConfig(), steps=5, first_steps=5, filter_px2=0.1, **STEP_SIZES)
+    gaussians, given = arguments(bundle, device, config, pictures_of(bundle))
+    stays = bundle.num_gaussians // 2 < np.arange(bundle.num_gaussians)
+    given["radius"][stays] = 0
+    _core.refine_cuts(**given)
+    moves = ~stays
+    moves[: len(bundle.level_gaussians(0))] = False
+    moved = host(gaussians)
+    for name, values in vars(bundle.gaussians).items():
+        np.testing.assert_array_equal(getattr(moved, name)[stays], values[stays])
+        assert (getattr(moved, name)[moves] != values[moves]).any()
+
+
 def test_all_cuts_of_a_view_have_its_window(bundle):
     """A target is drawn once and compared with several cuts."""
     cameras = v3dg.turntable((0, 0, 0), 3.0, 3, width=640, height=360)
@@ -607,7 +621,9 @@ def test_the_core_refuses_what_does_not_fit(bundle, device):
     _, given = arguments(bundle, device, BuildConfig(steps=1), pictures_of(bundle))
     count = bundle.num_gaussians
     wrong = {
-        "radius: expected positive numbers, got 0": {"radius": np.zeros(count, np.float32)},
+        "radius: expected numbers of at least 0, got -1": {
+            "radius": np.full(count, -1, np.float32)
+        },
         "radius: expected": {"radius": np.ones(count - 1, np.float32)},
         f"gaussians: expected {count} as in the table, got {count - 1}": {
             "gaussians": on(device, bundle.gaussians.subset(np.arange(count - 1))).rows,

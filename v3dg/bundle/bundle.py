@@ -7,7 +7,6 @@ import html
 import os
 from collections.abc import Iterable
 from dataclasses import fields, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +23,13 @@ from v3dg.bundle.pages import (
     FilePages,
     MemoryPages,
     PageLayout,
+    Pages,
     on_threads,
     runs_of_pages,
 )
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
-_Pages: TypeAlias = MemoryPages | CodePages | FilePages
 _RUN_BYTES = 64 << 20  # bytes of pages that are encoded together
 
 
@@ -72,7 +71,7 @@ class Bundle:
         if codec != Codec.name:
             clusters = clusters.around(gaussians)
         layout = PageLayout.of(clusters)
-        pages: _Pages
+        pages: Pages
         if codec == Codec.name:
             pages = MemoryPages(layout, gaussians, page_codec)
         else:
@@ -84,7 +83,7 @@ class Bundle:
         clusters: Clusters,
         groups: Groups,
         config: JsonObject,
-        pages: _Pages,
+        pages: Pages,
         file: BundleFile | None = None,
     ) -> None:
         self.config = config
@@ -96,6 +95,21 @@ class Bundle:
         self._layout = pages.layout
         self._pages = pages
         self._file = file
+
+    @classmethod
+    def of_pages(
+        cls, clusters: Clusters, groups: Groups, config: JsonObject, pages: Pages
+    ) -> Bundle:
+        """Return a bundle with these pages, which are read when they are needed.
+
+        Raises:
+            ValueError: The tables are inconsistent, or do not guarantee an exact cut.
+        """
+        clusters = replace(clusters)
+        check_tables(clusters, groups, int(clusters.offset[-1]))
+        bundle = cls.__new__(cls)
+        cls._set(bundle, clusters, groups, parse_json(config_to_json(config)), pages)
+        return bundle
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
@@ -278,7 +292,7 @@ class Bundle:
         return pages.codes
 
     def _in_memory(self) -> MemoryPages | CodePages:
-        if isinstance(self._pages, FilePages):
+        if not isinstance(self._pages, MemoryPages | CodePages):
             self._pages = self._pages.in_memory()
         return self._pages
 
@@ -290,7 +304,7 @@ class Bundle:
     @property
     def is_in_memory(self) -> bool:
         """Whether all gaussians are in memory; if not, they are read page by page."""
-        return not isinstance(self._pages, FilePages)
+        return isinstance(self._pages, MemoryPages | CodePages)
 
     @property
     def page_source(self) -> _core.Rows | _core.FileSource:
@@ -306,6 +320,38 @@ class Bundle:
         no group replaces."""
         check_index("page", page, self.num_pages)
         return self._pages.read(page, page + 1)
+
+    @property
+    def page_hashes(self) -> NDArray[np.uint8]:
+        """(P, 16) the hashes of the pages in the bundle's file.
+
+        Raises:
+            ValueError: The bundle is not in a file.
+        """
+        check("bundle", self._file is not None, "a bundle in a file, got one in memory")
+        assert self._file is not None
+        return self._file.tables["pages.hash"]
+
+    @property
+    def pages(self) -> Pages:
+        """The pages, in memory or read when they are needed."""
+        return self._pages
+
+    def pages_of(self, clusters: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the indices of the pages that contain clusters, each once, ascending.
+        The clusters must be in ascending order."""
+        pages = np.searchsorted(self._layout.first_cluster, clusters, side="right") - 1
+        return np.unique(pages)
+
+    def pages_gaussians(self, pages: NDArray[np.int64]) -> Gaussians:
+        """Return the gaussians of some pages, in the order of the pages."""
+        starts = np.flatnonzero(np.diff(pages, prepend=-2) != 1)
+        ends = [*starts[1:].tolist(), len(pages)]
+        pieces = [
+            self._pages.read(int(pages[start]), int(pages[end - 1]) + 1)
+            for start, end in zip(starts.tolist(), ends, strict=True)
+        ]
+        return Gaussians.concatenate(pieces)
 
     def cluster_gaussians(self, cluster: int) -> Gaussians:
         """Return the gaussians of one cluster. The cluster's page is cached until

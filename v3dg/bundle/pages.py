@@ -1,12 +1,13 @@
 """Pages: the clusters of each page, and the sources of their gaussians. codec.py
 defines the bytes of a page."""
 
+import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,6 +197,53 @@ class FilePages:
             return CodePages(self.layout, words, self.codec)
         except ValueError as error:
             raise ValueError(f"{self._file.path}: {error}; {_core.DAMAGED}") from None
+
+
+class JoinedPages:
+    """Pages that are those of several bundles. They are read from there when they are
+    needed."""
+
+    def __init__(
+        self,
+        layout: PageLayout,
+        sources: Sequence["Pages"],
+        source: NDArray[np.int64],
+        page: NDArray[np.int64],
+    ) -> None:
+        """Args:
+        source, page: (P,) for each page, the number of its source, and of the page
+            there.
+        """
+        self.layout = layout
+        self.codec: Codec = sources[0].codec
+        self._sources = sources
+        self._source = source
+        self._page = page
+
+    def read(self, first_page: int, last_page: int) -> Gaussians:
+        """Return the gaussians of neighbouring pages."""
+        source = self._source[first_page:last_page]
+        page = self._page[first_page:last_page]
+        follows = (np.diff(source) == 0) & (np.diff(page) == 1)
+        starts = [0, *(np.flatnonzero(~follows) + 1).tolist()]
+        pieces: list[Gaussians] = [
+            self._sources[source[start]].read(int(page[start]), int(page[end - 1]) + 1)
+            for start, end in itertools.pairwise([*starts, len(page)])
+        ]
+        if len(pieces) == 1:
+            return pieces[0]
+        return Gaussians.concatenate(pieces)
+
+    def in_memory(self) -> MemoryPages | CodePages:
+        """Read all pages, and return them in memory."""
+        gaussians = self.read(0, self.layout.num_pages)
+        if self.codec.name == Codec.name:
+            return MemoryPages(self.layout, gaussians, self.codec)
+        return CodePages.of(self.layout, gaussians, self.codec)
+
+
+Pages: TypeAlias = MemoryPages | CodePages | FilePages | JoinedPages
+"""The pages of a bundle: in memory, in a file, or in other bundles."""
 
 
 def on_threads(

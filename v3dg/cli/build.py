@@ -27,7 +27,8 @@ from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, asset_file, open_asset, run_files, subject_name
 from v3dg.levels import BuildConfig, DraftWarning, build_file, levels_path
 from v3dg.levels.memory import free_bytes
-from v3dg.levels.quality import Quality, estimated_seconds, pictures_of, refine_bytes
+from v3dg.levels.quality import Quality, estimated_seconds, pictures_of
+from v3dg.levels.refine_sizes import refine_bytes
 from v3dg.levels.scheduler import SchedulerError
 from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.upright import ASSUMED, up_of
@@ -354,6 +355,7 @@ def _build(
         "gaussians": bundle.num_gaussians,
         "clusters": len(bundle.clusters),
         "levels": bundle.num_levels,
+        "sh_degree": bundle.sh_degree,
         "quality": _quality_of(options, bundle),
         "refined": bundle.config.get("refined"),
         "estimated_seconds": _estimated_seconds(options, bundle, is_built=is_built),
@@ -490,7 +492,7 @@ def _estimated_seconds(options: Build, bundle: Bundle, *, is_built: bool) -> flo
     device = _device.resolve(options.device)
     if not is_draft or device.is_cuda or options.quiet or options.quality == "draft":
         return None
-    if refine_bytes("standard", bundle.config["asset_gaussians"], bundle.sh_degree) > free_bytes():
+    if refine_bytes(bundle.config["asset_gaussians"], bundle.sh_degree) > free_bytes():
         return None
     return estimated_seconds(bundle, device)
 
@@ -501,7 +503,7 @@ def _refine_advice(result: JsonObject) -> str:
     output = Path(result["output"])
     refined = output.with_name(f"{output.stem}_refined.v3dg")
     num_leaves = result["asset_gaussians"] - sum(result["dropped"].values())
-    pictures = str(pictures_of("standard", num_leaves))
+    pictures = str(pictures_of("standard", num_leaves, result["sh_degree"]))
     command = shlex.join(["v3dg", "refine", str(output), str(refined), "--steps", pictures])
     return (
         f"draft: `{command}` makes its levels more similar to the asset; it takes about "

@@ -18,6 +18,7 @@ from v3dg.cameras import Camera
 from v3dg.cli import _common
 from v3dg.cli._views import CameraFile
 from v3dg.framing import frame_subject
+from v3dg.levels.unfinished import discard_units, units_folder
 from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.metrics import MIN_TRANSMITTANCE, draw_truth
 from v3dg.pictures import to_8bit
@@ -35,14 +36,16 @@ _NOTICED_DB = 0.05
 @dataclass(kw_only=True)
 class Refine(CameraFile, _common.OnDevice):
     """Make the levels of a bundle more similar to its asset. This takes much longer
-    than building it."""
+    than building it. If it is interrupted, the same command continues after the last
+    unit of a large asset."""
 
     bundle: tyro.conf.Positional[Path]
     """Bundle (.v3dg) that `v3dg build` wrote."""
     output: tyro.conf.Positional[Path]
     """Bundle to write (.v3dg)."""
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000
-    """Number of pictures of cuts that are compared with pictures of the asset."""
+    """Number of pictures of cuts that are compared with pictures of the asset. An asset
+    of more than 4 million gaussians is refined in units, each with this number."""
     cameras: Annotated[Path | None, _common.option("PATH")] = None
     """File or folder of cameras, as for `v3dg render`, such as those of the asset's
     photographs. By default, cameras are found, see --seen-from."""
@@ -64,39 +67,60 @@ def run(options: Refine) -> None:
     )
     _common.check_output(options.output, options.bundle)
     make_folder(options.output)
-    cameras = list(options.read().values())
     start = time.perf_counter()
     bundle = Bundle.open(options.bundle)
+    refined = _refined_file(bundle, options)
+    seconds = time.perf_counter() - start
+    num_units = refined.config.get("refined", {}).get("units", 1)
+    rows: list[JsonObject] = []
+    if num_units == 1:  # else the pictures would need memory for the whole asset
+        rows = list(_compared(bundle, refined, options))
+    result = {
+        "output": str(options.output),
+        "steps": options.steps,
+        "units": num_units,
+        "seconds": seconds,
+        "psnr": rows,
+    }
+    lines = [_summary(result, refined)]
+    if rows:
+        columns = [
+            _common.Column("picture", "{width} x {width}"),
+            _common.Column("PSNR before", "{before:.2f}"),
+            _common.Column("after", "{after:.2f}"),
+        ]
+        lines += ["", *_common.table_lines(columns, rows), *_warning(rows)]
+    _common.print_result(result, lines, as_json=options.json)
+
+
+def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
+    """Write the refined bundle, and return it, opened from its file."""
     refined = refine_bundle(
         bundle,
-        cameras=cameras,
+        cameras=list(options.read().values()),
         seen_from=options.seen_from,
         steps=options.steps,
         drop=options.drop,
         seed=options.seed,
         device=options.device,
         progress=not options.quiet,
+        folder=units_folder(options.output),
     )
     refined.write(options.output)
-    seconds = time.perf_counter() - start
-    rows = list(_compared(bundle, refined, options))
-    result = {
-        "output": str(options.output),
-        "steps": options.steps,
-        "seconds": seconds,
-        "psnr": rows,
-    }
-    line = f"{options.output}: {options.steps:,} steps, {seconds:.1f} s"
+    discard_units(options.output)
+    return Bundle.open(options.output)
+
+
+def _summary(result: JsonObject, refined: Bundle) -> str:
+    """Return the line about what was refined, and how long it took."""
+    line = f"{result['output']}: {result['steps']:,} steps"
+    if result["units"] > 1:
+        line += f" for each of {result['units']} units and the levels above them"
+    line += f", {result['seconds']:.1f} s"
     viewpoints = text_of(refined.config.get("refined", {}))
     if viewpoints:
         line += f", {viewpoints}"
-    columns = [
-        _common.Column("picture", "{width} x {width}"),
-        _common.Column("PSNR before", "{before:.2f}"),
-        _common.Column("after", "{after:.2f}"),
-    ]
-    lines = [line, "", *_common.table_lines(columns, rows), *_warning(rows)]
-    _common.print_result(result, lines, as_json=options.json)
+    return line
 
 
 def _compared(bundle: Bundle, refined: Bundle, options: Refine) -> Iterator[JsonObject]:

@@ -7,19 +7,23 @@ Pictures and gradients are those of `v3dg.rasterize`, on the CPU and on CUDA dev
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
 
 from v3dg import _core
+from v3dg._device import CPU
 from v3dg._numbers import check, one_of, real, value_text, whole
+from v3dg.camera_batch import CameraBatch
 from v3dg.cameras import Camera
-from v3dg.gaussians import Array, Gaussians
+from v3dg.gaussians import Gaussians
 from v3dg.rasterize import (
     CenterGradient,
     CenterProbe,
     DrawSettings,
+    Views,
     check_device,
     draw_views,
     joined,
@@ -36,6 +40,7 @@ _LOCATED = (
     "conics",
     "opacities",
     "radii",
+    "batch_ids",
     "camera_ids",
     "gaussian_ids",
     "is_seen",
@@ -85,7 +90,9 @@ def rasterization(
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
     """Draw N gaussians for C cameras, like the function with this name in gsplat 1.5.
 
-    The tensors must be float32 or, on the CPU, all float64.
+    All cameras are drawn together. The tensors must be float32 or, on the CPU, all
+    float64. As in gsplat, all tensors may have the same batch dimensions in front, for
+    several sets of N gaussians with C cameras each; so have the results.
 
     Args:
         means: (N, 3) centres in world space.
@@ -94,8 +101,10 @@ def rasterization(
         opacities: (N,) in [0, 1]; not logits.
         colors: (N, 3) or (C, N, 3) colours; with `sh_degree` (N, K, 3) or (C, N, K, 3)
             coefficients.
-        viewmats: (C, 4, 4) world to camera, without gradient.
-        Ks: (C, 3, 3) intrinsics in px.
+        viewmats: (C, 4, 4) world to camera. Their gradient is that of matrices with
+            independent elements, so that it may be passed on to any parameters of
+            poses. The last row has no gradient.
+        Ks: (C, 3, 3) intrinsics in px, without gradient.
         width: Width of the pictures in px.
         height: Height of the pictures in px.
         near_plane: Gaussians with a smaller depth are not drawn.
@@ -118,9 +127,9 @@ def rasterization(
     Returns:
         Pictures (C, H, W, D), alphas (C, H, W, 1), and a dict: `means2d`, `depths`,
         `conics`, `opacities` and `radii`, which are (C, N, ...) or, if `packed`, have
-        one row per visible pair; `camera_ids` and `gaussian_ids` of the pairs; `width`,
-        `height` and `n_cameras`. `means2d` receives gradients, and has `.absgrad` if
-        `absgrad` is set.
+        one row per visible pair; `batch_ids`, `camera_ids` and `gaussian_ids` of the
+        pairs; `width`, `height`, `n_batches` and `n_cameras`. `means2d` receives
+        gradients, and has `.absgrad` if `absgrad` is set.
 
     Raises:
         ValueError: A shape or a value is wrong, or is not supported.
@@ -140,9 +149,9 @@ def rasterization(
         rasterize_mode=rasterize_mode,
     )
     shape = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    _check_tensors({**shape, "colors": colors, "viewmats": viewmats, "Ks": Ks})
-    cameras = _cameras(viewmats, Ks, width, height, near_plane)
-    return _draw(look, cameras, list(shape.values()), colors, size=(width, height))
+    sizes = _sizes(shape, colors, viewmats, Ks)
+    views = _views(sizes, viewmats, Ks, (width, height), near_plane)
+    return _draw(look, views, sizes, list(shape.values()), colors, (width, height))
 
 
 def _check_tensors(tensors: Mapping[str, torch.Tensor]) -> None:
@@ -189,6 +198,15 @@ class _Look:
         return self.far_plane < _FARTHEST or self.radius_clip > 0
 
     @property
+    def settings(self) -> DrawSettings:
+        return DrawSettings(
+            filter_px2=self.eps2d,
+            antialiased=self.rasterize_mode == "antialiased",
+            with_depth=self.depth != "",
+            plain_colors=self.sh_degree is None or not self.has_color,
+        )
+
+    @property
     def has_color(self) -> bool:
         return "RGB" in self.render_mode
 
@@ -212,26 +230,79 @@ def _check_unsupported(options: dict[str, object]) -> None:
             raise ValueError(f"{name}: {value_text(value)} is not supported; {_UNSUPPORTED[name]}")
 
 
-def _cameras(
-    viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int, near: float
-) -> list[_core.Camera]:
-    check(
-        "viewmats",
-        not viewmats.requires_grad,
-        "tensors without gradient, got tensors that require it; cameras are not trained, so call "
-        ".detach()",
-    )
-    check("Ks", len(Ks) == len(viewmats), f"as many as viewmats ({len(viewmats)}), got {len(Ks)}")
-    pairs = zip(viewmats.cpu().numpy(), Ks.detach().cpu().numpy(), strict=True)
-    return [Camera(viewmat, K, width, height, near).core for viewmat, K in pairs]
+@dataclass(frozen=True)
+class _Sizes:
+    """The numbers of sets, cameras and gaussians."""
+
+    batch: tuple[int, ...]  # batch dimensions; the product is the number of sets
+    num_cameras: int
+    num_gaussians: int
+
+    @property
+    def num_sets(self) -> int:
+        return math.prod(self.batch)
+
+    @property
+    def num_views(self) -> int:
+        return self.num_sets * self.num_cameras
+
+
+def _sizes(
+    shape: Mapping[str, torch.Tensor],
+    colors: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+) -> _Sizes:
+    """Return the sizes that the tensors have; raise an error if they are no tensors, or
+    do not fit together. The shapes of one set are checked later."""
+    _check_tensors({**shape, "colors": colors, "viewmats": viewmats, "Ks": Ks})
+    means = shape["means"]
+    batch = tuple(means.shape[:-2])
+    for name, num_dimensions in (("quats", 2), ("scales", 2), ("opacities", 1)):
+        of_tensor = tuple(shape[name].shape[:-num_dimensions])
+        expected = f"the batch dimensions {batch} of means"
+        check(name, of_tensor == batch, f"{expected}, got shape {tuple(shape[name].shape)}")
+    expected_viewmats = (*batch, "C", 4, 4)
+    poses = tuple(viewmats.shape)
+    fits = len(poses) == len(expected_viewmats) and poses[-2:] == (4, 4) and poses[:-3] == batch
+    check("viewmats", fits, f"shape {expected_viewmats}, got {poses}".replace("'", ""))
+    num_cameras = poses[-3]
+    check("viewmats", num_cameras > 0, "at least one camera, got none")
+    check("means", math.prod(batch) > 0, f"at least one set, got batch dimensions {batch}")
+    if Ks.ndim == viewmats.ndim and Ks.shape[:-3] == batch:
+        expected = f"as many as viewmats ({num_cameras})"
+        check("Ks", Ks.shape[-3] == num_cameras, f"{expected}, got {Ks.shape[-3]}")
+    expected_Ks = (*batch, num_cameras, 3, 3)
+    check("Ks", tuple(Ks.shape) == expected_Ks, f"shape {expected_Ks}, got {tuple(Ks.shape)}")
+    num_gaussians = 0
+    if means.ndim >= 2:
+        num_gaussians = int(means.shape[-2])
+    return _Sizes(batch, num_cameras, num_gaussians)
+
+
+def _views(
+    sizes: _Sizes, viewmats: torch.Tensor, Ks: torch.Tensor, size: tuple[int, int], near: float
+) -> Views:
+    """Return the cameras of each set."""
+    count = sizes.num_cameras
+    poses = viewmats.detach().cpu().reshape(-1, count, 4, 4).numpy()
+    intrinsics = Ks.detach().cpu().reshape(-1, count, 3, 3).numpy()
+    pairs = zip(poses, intrinsics, strict=True)
+    if count == 1 and not viewmats.requires_grad:
+        return Views(tuple(Camera(pose[0], K[0], *size, near).core for pose, K in pairs), count)
+    cameras = tuple(CameraBatch(pose, K, *size, near).core_on(CPU) for pose, K in pairs)
+    trained = None
+    if viewmats.requires_grad:
+        trained = viewmats.reshape(-1, 4, 4)
+    return Views(cameras, count, trained)
 
 
 def _sh_of_views(
-    look: _Look, colors: torch.Tensor, num_cameras: int, means: torch.Tensor
+    look: _Look, colors: torch.Tensor, sizes: _Sizes, means: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Return the SH coefficients (N, K, 3) for the core: one array for all cameras, or
-    one array per camera."""
-    count = len(means)
+    """Return the SH coefficients (N, K, 3) for the core: one array for all cameras, one
+    for each set, or one for each camera."""
+    count = sizes.num_gaussians
     if not look.has_color:
         return [means.new_zeros(count, 1, 3)]
     if look.sh_degree is None:
@@ -240,18 +311,18 @@ def _sh_of_views(
     else:
         expected = (count, (look.sh_degree + 1) ** 2, 3)
         coefficients = colors[..., : expected[1], :]
-    is_right = tuple(coefficients.shape) in (expected, (num_cameras, *expected))
+    for_all = (*sizes.batch, *expected)
+    for_each = (*sizes.batch, sizes.num_cameras, *expected)
+    is_right = tuple(coefficients.shape) in (for_all, for_each)
     shape = (
-        f"{(count, 3)}, or at least {expected} with sh_degree, or the same with a first dimension "
-        "for cameras"
+        f"{(*sizes.batch, count, 3)}, or at least {for_all} with sh_degree, or the same with a "
+        "dimension for cameras before that for gaussians"
     )
     check("colors", is_right, f"shape {shape}, got {tuple(colors.shape)}")
-    if coefficients.ndim == 3:
-        return [coefficients.contiguous()]
-    return [part.contiguous() for part in coefficients]
+    return [part.contiguous() for part in _of_sets(coefficients, coefficients.ndim - 3)]
 
 
-def _background_of_views(look: _Look, num_cameras: int, dtype: torch.dtype) -> list[torch.Tensor]:
+def _background_of_views(look: _Look, sizes: _Sizes, dtype: torch.dtype) -> list[torch.Tensor]:
     """Return background colours (3,): black for all cameras, or one colour per
     camera."""
     import torch
@@ -259,55 +330,75 @@ def _background_of_views(look: _Look, num_cameras: int, dtype: torch.dtype) -> l
     if look.backgrounds is None or not look.has_color:
         return [torch.zeros(3, dtype=dtype)]
     shape = tuple(look.backgrounds.shape)
-    check("backgrounds", shape == (num_cameras, 3), f"shape {(num_cameras, 3)}, got {shape}")
-    return list(look.backgrounds)
+    expected = (*sizes.batch, sizes.num_cameras, 3)
+    check("backgrounds", shape == expected, f"shape {expected}, got {shape}")
+    return list(look.backgrounds.flatten(0, -2))
 
 
 def _draw(
     look: _Look,
-    cameras: list[_core.Camera],
+    views: Views,
+    sizes: _Sizes,
     shape: list[torch.Tensor],
     colors: torch.Tensor,
     size: tuple[int, int],
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
     """Return pictures, alphas and gsplat's dict. ``shape`` is means, quats, scales and
     opacities; ``size`` is width and height in px."""
-    *geometry, opacity = (tensor.contiguous() for tensor in shape)
+    num_batch = len(sizes.batch)
+    by_set = [_of_sets(tensor, num_batch) for tensor in shape]
+    *geometry, opacities = by_set
     gradient = CenterGradient()
-    located = _locate()(look, cameras, gradient, *geometry, opacity)
+    located = _locate()(
+        look, views, sizes, gradient, *(tensor for group in by_set for tensor in group)
+    )
     info: Info = dict(zip(_LOCATED, located, strict=True))
     is_seen = info.pop("is_seen")
     pairs: tuple[torch.Tensor, torch.Tensor] | EllipsisType = ...
     if look.packed:
-        pairs = (info["camera_ids"], info["gaussian_ids"])
+        views_of_pairs = info["batch_ids"] * sizes.num_cameras + info["camera_ids"]
+        pairs = (views_of_pairs, info["gaussian_ids"])
     probe = CenterProbe(info["means2d"], pairs, with_sizes=look.absgrad, gradient=gradient)
-    opacities = [opacity]
     if look.clips:
-        opacities = [opacity * is_seen_by_camera for is_seen_by_camera in is_seen]
-    settings = DrawSettings(
-        filter_px2=look.eps2d,
-        antialiased=look.rasterize_mode == "antialiased",
-        with_depth=look.depth != "",
-        plain_colors=look.sh_degree is None or not look.has_color,
-    )
-    sh = _sh_of_views(look, colors, len(cameras), geometry[0])
-    backgrounds = _background_of_views(look, len(cameras), colors.dtype)
-    inputs = [*([tensor] for tensor in geometry), opacities, sh, backgrounds]
-    planes = draw_views(cameras, settings, inputs, probe)
-    alphas = planes[1::3]
+        opacities = [
+            opacities[view // sizes.num_cameras] * is_seen_by_camera
+            for view, is_seen_by_camera in enumerate(is_seen)
+        ]
+    sh = _sh_of_views(look, colors, sizes, shape[0])
+    backgrounds = _background_of_views(look, sizes, colors.dtype)
+    groups = [*geometry, opacities, sh, backgrounds]
+    planes = draw_views(views, look.settings, groups, probe)
+    alphas = _whole(planes[1::3], sizes.batch)
     pictures = [
         _picture(look, color, alpha, depth)
-        for color, alpha, depth in zip(planes[::3], alphas, planes[2::3], strict=True)
+        for color, alpha, depth in zip(planes[::3], planes[1::3], planes[2::3], strict=True)
     ]
     info["width"], info["height"] = size
-    info["n_cameras"] = len(cameras)
-    return joined(pictures), joined(alphas)[..., None], info
+    info["n_batches"] = sizes.num_sets
+    info["n_cameras"] = sizes.num_cameras
+    return _whole(pictures, sizes.batch), alphas[..., None], info
+
+
+def _of_sets(tensor: torch.Tensor, num_batch: int) -> list[torch.Tensor]:
+    """Return the contiguous tensor of each set."""
+    tensor = tensor.contiguous()
+    if num_batch == 0:
+        return [tensor]
+    return list(tensor.flatten(0, num_batch - 1))
+
+
+def _whole(parts: Sequence[torch.Tensor], batch: tuple[int, ...]) -> torch.Tensor:
+    """Return the planes of all sets with the batch dimensions."""
+    if not batch:
+        return parts[0]
+    stacked = joined(parts)
+    return stacked.view(*batch, *stacked.shape[1:])
 
 
 def _picture(
     look: _Look, color: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None
 ) -> torch.Tensor:
-    """Return the channels (H, W, D) of a picture that the render mode requests."""
+    """Return the channels (C, H, W, D) of pictures that the render mode requests."""
     import torch
 
     if depth is None:
@@ -324,6 +415,7 @@ class _Context(Protocol):
     `torch.autograd.Function`."""
 
     gradient: CenterGradient
+    needs_input_grad: tuple[bool, ...]
 
     def set_materialize_grads(self, value: object) -> None: ...
     def mark_non_differentiable(self, *tensors: torch.Tensor) -> None: ...
@@ -345,13 +437,14 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
         def forward(
             ctx: _Context,
             look: _Look,
-            cameras: list[_core.Camera],
+            views: Views,
+            sizes: _Sizes,
             gradient: CenterGradient,
             *shape: torch.Tensor,
         ) -> tuple[torch.Tensor | None, ...]:
             ctx.set_materialize_grads(value=False)
             ctx.gradient = gradient
-            (means2d, depths, *constants), optional = _located(look, cameras, *shape)
+            (means2d, depths, *constants), optional = _located(look, views, sizes, shape)
             ctx.mark_non_differentiable(
                 *constants, *(tensor for tensor in optional if tensor is not None)
             )
@@ -361,6 +454,7 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
         def backward(
             ctx: _Context, d_means2d: torch.Tensor | None, d_depths: torch.Tensor | None, *_: None
         ) -> tuple[None, ...]:
+            num_inputs = len(ctx.needs_input_grad)
             gradient = ctx.gradient.value
             ctx.gradient.value = None
             is_all = (
@@ -375,47 +469,71 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
                 "a loss on pictures only, got a loss on one of these tensors; project the means "
                 "in torch instead",
             )
-            return (None,) * 7
+            return (None,) * num_inputs
 
     return Locate.apply
 
 
 def _located(
-    look: _Look,
-    cameras: list[_core.Camera],
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
+    look: _Look, views: Views, sizes: _Sizes, shape: Sequence[torch.Tensor]
 ) -> tuple[list[torch.Tensor], list[torch.Tensor | None]]:
     """Return centres, depths, conics, opacities and radii; then, where needed, the
-    cameras and gaussians of the visible pairs, and (C, N) whether each gaussian is
-    visible."""
+    sets, cameras and gaussians of the visible pairs, and (V, N) whether each gaussian
+    is visible. `shape` is the means of all sets, then their quats, and so on."""
     import torch
 
-    unused_colors = means[:, None]
-    rows = Gaussians(means, quats, scales, opacities, unused_colors).rows
-    columns = zip(*(_ellipses(rows, camera, look) for camera in cameras), strict=True)
-    arrays = [joined([torch.as_tensor(part) for part in column]) for column in columns]
+    num_sets = sizes.num_sets
+    columns: list[list[torch.Tensor]] = []
+    for number, cameras in enumerate(views.cameras):
+        means, quats, scales, opacities = shape[number::num_sets]
+        unused_colors = means[:, None]
+        rows = Gaussians(means, quats, scales, opacities, unused_colors).rows
+        columns.append(_ellipses(rows, cameras, look))
+    arrays = []
+    for column in zip(*columns, strict=True):
+        whole = column[0]
+        if num_sets > 1:
+            whole = torch.cat(column)
+        arrays.append(whole)
     is_seen = None
-    camera_ids = None
-    gaussian_ids = None
+    ids: list[torch.Tensor | None] = [None, None, None]
     if look.packed or look.clips:
         is_seen = (arrays[4] > 0).all(-1)
     if look.packed and is_seen is not None:
-        camera_ids, gaussian_ids = torch.where(is_seen)
-        arrays = [array[camera_ids, gaussian_ids] for array in arrays]
-    return arrays, [camera_ids, gaussian_ids, is_seen]
+        view_ids, gaussian_ids = torch.where(is_seen)
+        arrays = [array[view_ids, gaussian_ids] for array in arrays]
+        camera_ids = view_ids % sizes.num_cameras
+        ids = [view_ids // sizes.num_cameras, camera_ids, gaussian_ids]
+    elif sizes.batch:
+        arrays = [array.view(*sizes.batch, sizes.num_cameras, *array.shape[1:]) for array in arrays]
+    return arrays, [*ids, is_seen]
 
 
-def _ellipses(rows: _core.Rows, camera: _core.Camera, look: _Look) -> tuple[Array, ...]:
-    """Return centres, depths, conics, opacities and radii of gaussians on an image."""
-    ellipses = _core.ellipses(
+def _ellipses(
+    rows: _core.Rows, cameras: _core.Camera | _core.Cameras, look: _Look
+) -> list[torch.Tensor]:
+    """Return centres, depths, conics, opacities and radii (C, N, ...) of gaussians on
+    the images of cameras."""
+    import torch
+
+    antialiased = look.rasterize_mode == "antialiased"
+    if isinstance(cameras, _core.Cameras):
+        arrays = _core.ellipses_of_views(
+            rows,
+            cameras,
+            filter_px2=look.eps2d,
+            antialiased=antialiased,
+            far_depth=look.far_plane,
+            min_radius_px=look.radius_clip,
+        )
+        return [torch.as_tensor(array) for array in arrays]
+    e = _core.ellipses(
         rows,
-        camera,
+        cameras,
         filter_px2=look.eps2d,
-        antialiased=look.rasterize_mode == "antialiased",
+        antialiased=antialiased,
         far_depth=look.far_plane,
         min_radius_px=look.radius_clip,
     )
-    return ellipses.centers, ellipses.depths, ellipses.conics, ellipses.opacities, ellipses.radii
+    of_camera = (e.centers, e.depths, e.conics, e.opacities, e.radii)
+    return [torch.as_tensor(array).unsqueeze(0) for array in of_camera]

@@ -81,13 +81,12 @@ def build_bundle(
             are fitted to the rounded gaussians of the levels below them.
         quality: "draft" leaves the levels as they are built. "standard" then refines
             them together (`v3dg.refine_bundle`) with 18,000 pictures and one more for
-            every 100 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
+            every 100 gaussians, for each unit: seconds on a GPU, minutes on a CPU.
             "best" uses five times as many pictures. docs/levels.md has the time and the
             gain of each. None means "standard" on a GPU and "draft" on a CPU, and for a
-            config without steps. An asset of more than 4,000,000 gaussians, or whose
-            refinement does not fit in the free memory, is then a draft, too, with a
-            `v3dg.levels.DraftWarning`. The levels at `resume_path` stay unrefined, and
-            the refined bundle is in memory.
+            config without steps. An asset whose refinement does not fit in the free
+            memory is then a draft, too, with a `v3dg.levels.DraftWarning`. The levels
+            at `resume_path` stay unrefined, and the refined bundle is in memory.
         seen_from: From where a refinement takes its pictures, see `v3dg.refine_bundle`.
 
     Raises:

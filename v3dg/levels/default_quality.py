@@ -6,10 +6,8 @@ from v3dg._device import Device
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.leaves import Leaves
 from v3dg.levels.memory import free_on, in_mib
-from v3dg.levels.quality import Quality, refine_bytes
-
-# The most gaussians of an asset that is refined by default: more would take minutes.
-_MOST_GAUSSIANS = 4_000_000
+from v3dg.levels.quality import Quality
+from v3dg.levels.refine_sizes import refine_bytes
 
 
 class DraftWarning(UserWarning):
@@ -27,24 +25,21 @@ def chosen_quality(
         memory: Bytes of the host that the build may use.
 
     Warns:
-        DraftWarning: The asset is too large to be refined without being told to.
+        DraftWarning: Too little memory is free to refine the asset.
     """
     if quality is not None:
         return quality
     if not device.is_cuda or config.steps == 0:
         return "draft"
     count = leaves.num_gaussians
+    required = refine_bytes(count, leaves.sh_degree)
     problem = ""
-    if count > _MOST_GAUSSIANS:
-        problem = f"{count:,} gaussians take minutes to refine"
-    else:
-        required = refine_bytes("standard", count, leaves.sh_degree)
-        for name, free in (("host", memory), ("GPU", free_on(device))):
-            if required > free and not problem:
-                problem = (
-                    f"refining {count:,} gaussians takes {in_mib(required)} of the {name}, "
-                    f"which has {in_mib(free)}"
-                )
+    for name, free in (("host", memory), ("GPU", free_on(device))):
+        if required > free and not problem:
+            problem = (
+                f"refining {count:,} gaussians takes {in_mib(required)} of the {name}, "
+                f"which has {in_mib(free)}"
+            )
     if not problem:
         return "standard"
     advice = "levels stay as they are built, unless the quality standard is named"

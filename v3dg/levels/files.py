@@ -22,7 +22,8 @@ from v3dg.levels.default_quality import chosen_quality
 from v3dg.levels.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.levels.leaves_on_disk import MOST_GAUSSIANS, leaves_on_disk
 from v3dg.levels.memory import in_bytes, in_mib, most_units, unit_bytes
-from v3dg.levels.quality import Quality, refine_bytes, refinement_of
+from v3dg.levels.quality import Quality, refined_settings, refinement_of
+from v3dg.levels.refine_sizes import refine_bytes
 from v3dg.levels.unfinished import discard_levels
 from v3dg.levels.viewpoints import SeenFrom
 from v3dg.levels.whole import build_into, devices_for
@@ -193,7 +194,9 @@ class _FileBuild:
         """Raise ValueError before the build if its refinement would need too much
         memory."""
         count = leaves.num_gaussians
-        required = refine_bytes(quality, count, leaves.sh_degree)
+        required = 0
+        if quality != "draft":
+            required = refine_bytes(count, leaves.sh_degree)
         check(
             "memory",
             self.num_bytes >= required,
@@ -205,11 +208,13 @@ class _FileBuild:
         """Return whether the bundle exists, was built from these leaves with these
         settings, and has not been converted to another codec."""
         settings = made_with(leaves, config, self.seed, self.codec, self.up)
-        refinement = refinement_of(quality, leaves.num_gaussians, settings["seed"], self.seen_from)
+        request = refinement_of(
+            quality, leaves.num_gaussians, leaves.sh_degree, settings["seed"], self.seen_from
+        )
         try:
             bundle = Bundle.open(self.bundle_path)
-            if refinement is not None:
-                settings = refinement.settings_of(bundle, settings)
+            if request is not None:
+                settings = refined_settings(request, bundle, settings)
             return bundle.config == settings and bundle.codec == self.codec
         except (ValueError, OSError):  # missing, damaged, or of another version: build it again
             return False

@@ -19,8 +19,8 @@ from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
-from v3dg.levels.rows import RUN_ROWS, in_runs
-from v3dg.levels.viewpoints import SeenFrom, viewpoints_of
+from v3dg.levels.rows import in_runs
+from v3dg.levels.viewpoints import SeenFrom
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
@@ -38,44 +38,73 @@ _NUM_WEIGHING_PICTURES = 2_000
 _LEAST_LOOKS = 8
 
 
-def refined_bundle(
+@dataclass(frozen=True)
+class RefineRequest:
+    """What a refinement does to a bundle; `v3dg.refine_bundle` has the meanings.
+
+    Attributes:
+        steps: Number of pictures that are compared; that of each unit if the bundle is
+            refined in several.
+    """
+
+    steps: int
+    drop: float
+    seed: int
+    seen_from: SeenFrom = "auto"
+    cameras: tuple[Camera, ...] = ()
+
+    def num_pictures(self, device: Device) -> tuple[int, int]:
+        """Return how many pictures weigh gaussians, and how many move them."""
+        num_weighing = 0
+        if self.drop > 0:
+            num_weighing = _NUM_WEIGHING_PICTURES
+        windows = default_steps(device).windows
+        return num_weighing, -(-self.steps // windows) * windows
+
+    def record(self) -> JsonObject:
+        """Return what the config of a refined bundle says of this request."""
+        record: JsonObject = {"steps": self.steps, "drop": self.drop, "seed": self.seed}
+        if self.seen_from != "auto":
+            record["seen_from"] = self.seen_from
+        if self.cameras:
+            record["cameras"] = len(self.cameras)
+        return record
+
+
+def with_refined_levels(
     bundle: Bundle,
-    *,
-    cameras: Sequence[Camera] = (),
-    seen_from: SeenFrom = "auto",
-    steps: int,
-    drop: float = DROP,
-    seed: int,
+    request: RefineRequest,
+    cameras: Sequence[Camera],
     device: Device,
     progress: Progress,
+    *,
+    text: str = "",
+    first_level: int = 1,
+    target_px2: float = 0.0,
 ) -> Bundle:
-    """Return a copy of a bundle with refined levels; see `v3dg.refine_bundle`."""
-    if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
-        return bundle
-    record = record_of(steps, drop, seed, seen_from)
-    text = ""
-    if cameras:
-        record["cameras"] = len(cameras)
-    else:
-        viewpoints = viewpoints_of(bundle, seen_from)
-        cameras = viewpoints.cameras
-        record |= viewpoints.record
-        text = viewpoints.text
-    if drop > 0:
-        bundle = without_unseen(bundle, cameras, drop, seed, device, progress)
-    cuts = Cuts(bundle, cameras, seed, device, progress)
-    moved = cuts.refined(steps, default_steps(device), text)
+    """Return the bundle with levels that are refined together, from level `first_level`
+    on.
+
+    Args:
+        text: What the progress bar shows.
+        target_px2: The filter with which level 0 is drawn as the target; 0 for an
+            asset.
+    """
+    if request.drop > 0:
+        bundle = without_unseen(
+            bundle, cameras, request.drop, request.seed, device, progress, first_level=first_level
+        )
+    cuts = Cuts(bundle, cameras, request.seed, device, progress)
+    moved = cuts.refined(
+        request.steps,
+        default_steps(device),
+        text,
+        first_level=first_level,
+        target_px2=target_px2,
+    )
     refined = in_runs(moved, bundle.clusters.offset)
-    config = {**bundle.config, "refined": record, "run_rows": RUN_ROWS}
-    return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
-
-
-def record_of(steps: int, drop: float, seed: int, seen_from: SeenFrom) -> JsonObject:
-    """Return what the config of a bundle says of the request for its refinement."""
-    record: JsonObject = {"steps": steps, "drop": drop, "seed": seed}
-    if seen_from != "auto":
-        record["seen_from"] = seen_from
-    return record
+    clusters = bundle.clusters.around(refined)
+    return Bundle(clusters, bundle.groups, refined, bundle.config, bundle.codec)
 
 
 def without_unseen(
@@ -85,16 +114,19 @@ def without_unseen(
     seed: int,
     device: Device,
     progress: Progress,
+    *,
+    first_level: int = 1,
 ) -> Bundle:
-    """Return the bundle without the least visible gaussians of each level above level
-    0.
+    """Return the bundle without the least visible gaussians of each level from
+    `first_level` on.
 
     `drop` is the share of a level's visibility, as measured in pictures of cuts, that
     may be lost.
     """
     cuts = Cuts(bundle, cameras, seed, device, progress)
     weights, looks = cuts.weights(_NUM_WEIGHING_PICTURES)
-    return _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, weights), drop)
+    known_weights = np.where(looks < _LEAST_LOOKS, np.nan, weights)
+    return _without_least(bundle, known_weights, drop, first_level)
 
 
 @dataclass(frozen=True)
@@ -165,15 +197,24 @@ class Cuts:
             seed=seed,
         )
 
-    def refined(self, num_pictures: int, settings: RefineSteps, text: str = "") -> Gaussians:
-        """Refine the gaussians with this number of pictures, rounded up to whole steps,
-        and return them; the progress bar shows the text."""
+    def refined(
+        self,
+        num_pictures: int,
+        settings: RefineSteps,
+        text: str = "",
+        *,
+        first_level: int = 1,
+        target_px2: float = 0.0,
+    ) -> Gaussians:
+        """Refine the gaussians from level `first_level` on with this number of
+        pictures, rounded up to whole steps, and return all; the progress bar shows the
+        text. Level 0 is the target, drawn with the filter `target_px2`."""
         clusters = self._bundle.clusters
-        ball = self._bundle.groups.ball
-        radius = np.where(clusters.own_group < 0, np.float32(1), ball[clusters.own_group, 3])
+        radius = np.append(self._bundle.groups.ball[:, 3], np.float32(0))[clusters.own_group]
+        radius[clusters.level < first_level] = 0  # these gaussians do not move
         radius = np.repeat(radius, np.diff(clusters.offset))
         leaves = self._gaussians.subset(self._leaves).rows
-        target = _core.FitTarget(leaves, filter_px2=0.0, antialiased=False)
+        target = _core.FitTarget(leaves, filter_px2=target_px2, antialiased=target_px2 > 0)
         comparison = _core.CutComparison(
             windows_per_step=settings.windows,
             cuts_per_view=settings.cuts_per_view,
@@ -222,15 +263,17 @@ class Cuts:
             return run_fit(lambda state: work(progress=state), self._device, show)
 
 
-def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
-    """Drop the gaussians of least weight from each level above level 0, up to a share
-    of the level's total weight.
+def _without_least(
+    bundle: Bundle, weight: npt.NDArray[np.float64], share: float, first_level: int = 1
+) -> Bundle:
+    """Drop the gaussians of least weight from each level from `first_level` on, up to a
+    share of the level's total weight.
 
     Gaussians whose weight is NaN stay, and are not counted in the total.
     """
     offset = bundle.clusters.offset
     is_kept = np.ones(bundle.num_gaussians, bool)
-    for level in range(1, bundle.num_levels):
+    for level in range(first_level, bundle.num_levels):
         clusters_of_level = bundle.level_range(level)
         rows = slice(offset[clusters_of_level.start], offset[clusters_of_level.stop])
         order = np.argsort(weight[rows], kind="stable")

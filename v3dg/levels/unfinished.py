@@ -8,6 +8,7 @@ from a bundle: a header of length 0, and the digest of the asset and the setting
 
 import json
 import os
+import re
 import stat
 import struct
 import threading
@@ -37,6 +38,9 @@ from v3dg.levels.simplify import Level, LevelTables
 # the arrays that follow.
 _RECORD = struct.Struct("<II16s")
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
+# Names in the folder of refined units: a bundle for each unit, and what a killed
+# process has left of one.
+_UNIT_NAME = re.compile(r"\d+\.v3dg|\.\d+\.v3dg\.[0-9a-f]+\.tmp")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +59,9 @@ Part = Mapping[int, tuple[LevelPlan, PageRun]]
 """The levels of a unit, or of the part above all units: the plan and the pages of each
 level, by the level's number."""
 
-Refine = Callable[[Bundle], Bundle]
-"""Returns a bundle with refined levels."""
+Refine = Callable[[Bundle, Path | None], Bundle]
+"""Returns a bundle with refined levels. Units are stored in the folder, if there is
+one, and the result may read its pages from there."""
 
 
 @dataclass(frozen=True)
@@ -253,10 +258,11 @@ class Unfinished:
         """
         _files.close_to_move(self._file)
         if refine is not None:
-            refined = refine(Bundle.open(self._path))
+            bundle = Bundle.open(self._path)
             if self._bundle_path is None:
-                return refined
-            refined.write(self._bundle_path)
+                return refine(bundle, None)
+            refine(bundle, units_folder(self._path)).write(self._bundle_path)
+            discard_units(self._path)
             self._path.unlink()
         elif self._bundle_path is not None:
             _files.put_in_place(self._path, self._bundle_path)
@@ -296,7 +302,25 @@ class MemoryStore:
         )
         if refine is None:
             return bundle
-        return refine(bundle)
+        return refine(bundle, None)
+
+
+def units_folder(levels_path: str | os.PathLike[str]) -> Path:
+    """Return the folder for refined units of the bundle, or of the unfinished levels,
+    at a path."""
+    return Path(levels_path).with_suffix(".units")
+
+
+def discard_units(levels_path: str | os.PathLike[str]) -> None:
+    """Remove the folder of refined units, if there is one. Other files in it stay."""
+    folder = units_folder(levels_path)
+    if folder.is_symlink() or not folder.is_dir():
+        return
+    for name in os.listdir(folder):
+        if _UNIT_NAME.fullmatch(name):
+            (folder / name).unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def described(device: Device) -> tuple[str, str]:
@@ -306,8 +330,8 @@ def described(device: Device) -> tuple[str, str]:
 
 
 def discard_levels(resume_path: str | os.PathLike[str]) -> None:
-    """Remove the levels that an interrupted build has left at this path, if there are
-    any.
+    """Remove the levels that an interrupted build has left at this path, and its
+    refined units, if there are any.
 
     Raises:
         ValueError: The file is of another kind; it is not removed.
@@ -320,6 +344,7 @@ def discard_levels(resume_path: str | os.PathLike[str]) -> None:
             is_ours = _MAGIC.startswith(head) or _is_bundle(resume_path)
             expected = "levels of an interrupted build, got another file; move it elsewhere"
             check(resume_path, is_ours, expected)
+            discard_units(resume_path)
             _files.close_to_move(file)
             os.unlink(resume_path)
 

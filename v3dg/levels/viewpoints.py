@@ -8,10 +8,12 @@ sides: then much that is seen from outside stands far from all places inside.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from v3dg._json import JsonObject
 from v3dg._numbers import Floats, one_of
@@ -23,8 +25,9 @@ from v3dg.upright import direction_of, up_of
 SeenFrom = Literal["auto", "outside", "inside", "both"]
 """From where a subject is seen; "auto" finds out."""
 
-RECORDED = ("eyes", "outside")
-"""The names that `Viewpoints.record` has."""
+RECORDED = ("eyes", "outside", "units")
+"""The names in the record of a refinement that follow from the gaussians: those that
+`Viewpoints.record` has, and the number of units."""
 
 _NUM_EYES = 96
 # Cameras at an eye, a quarter turn apart, alternately up and down by this angle, with
@@ -46,6 +49,9 @@ _NEAR = 0.002
 # The share of what is seen from outside of a surrounding subject that is not its walls,
 # above which it is seen from outside, too.
 _LEAST_OUTER = 0.08
+# The share of the gaussians of a part of a subject that a camera must see to be one of
+# those for the part.
+_LEAST_SEEN = 0.05
 
 
 @dataclass(frozen=True)
@@ -118,6 +124,31 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
         return Viewpoints(inside_cameras, len(eyes))
     outer_cameras = _cameras_around(middle, radius, len(inside_cameras))
     return Viewpoints((*inside_cameras, *outer_cameras), len(eyes))
+
+
+def cameras_that_see(bundle: Bundle, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Return the cameras with at least `_LEAST_SEEN` of a bundle's leaves in their
+    pictures; all of them if there are none."""
+    leaves = bundle.level_range(0)
+    middle = np.asarray(bundle.clusters.box[leaves.start : leaves.stop], np.float64).mean(axis=1)
+    weight = np.diff(bundle.clusters.offset)[leaves.start : leaves.stop]
+    seeing = tuple(
+        camera
+        for camera in cameras
+        if weight[_is_in_picture(camera, middle)].sum() >= _LEAST_SEEN * weight.sum()
+    )
+    return seeing or tuple(cameras)
+
+
+def _is_in_picture(camera: Camera, points: Floats) -> npt.NDArray[np.bool_]:
+    """Return (N,) whether each point is in front of a camera and in its picture,
+    without the distortion of its lens."""
+    x, y, depth = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
+    depth = np.where(depth > camera.near, depth, np.nan)
+    column = camera.fx * x / depth + camera.cx
+    row = camera.fy * y / depth + camera.cy
+    is_inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return np.asarray(is_inside)
 
 
 def _ball(bundle: Bundle) -> tuple[Floats, float]:

@@ -30,10 +30,20 @@ from v3dg.levels.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.levels.plan import Plan
 from v3dg.levels.progress import Bar
 from v3dg.levels.quality import Quality, refinement_of
+from v3dg.levels.refined import RefineRequest
+from v3dg.levels.refined_units import refined_bundle
 from v3dg.levels.scheduler import Watch, completed, watch_over
 from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
-from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
+from v3dg.levels.unfinished import (
+    FinishedLevel,
+    MemoryStore,
+    PageFile,
+    Part,
+    Refine,
+    Unfinished,
+    described,
+)
 from v3dg.levels.viewpoints import SeenFrom
 
 # Number of leaves in a unit: enough to keep a GPU busy, with little memory. The last
@@ -85,7 +95,9 @@ def build_into(
     units = plan.units(UNIT_LEAVES)
     page_codec = codec_of(codec, leaves.sh_degree)
     file = BundlePlan(plan.layout, page_codec, made_with(leaves, config, seed, codec, up))
-    refinement = refinement_of(quality, leaves.num_gaussians, file.config["seed"], seen_from)
+    request = refinement_of(
+        quality, leaves.num_gaussians, leaves.sh_degree, file.config["seed"], seen_from
+    )
     parts = _parts(plan, units, file)
     opened = _opened(path, file, parts, devices[0], bundle_path)
     with _device.memory_errors(), opened as store:
@@ -98,9 +110,16 @@ def build_into(
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
                 tables, hashes = build.all_levels(leaves, devices, most_units, executor)
             store.finish(*assemble(plan, tables, config), hashes)
-        if refinement is None:
-            return store.bundle()
-        return store.bundle(partial(refinement.refined, device=devices[0], progress=progress))
+        return store.bundle(_refine_of(request, devices, progress))
+
+
+def _refine_of(
+    request: RefineRequest | None, devices: Sequence[Device], progress: Progress
+) -> Refine | None:
+    """Return the function that refines the bundle at the end of a build."""
+    if request is None:
+        return None
+    return lambda bundle, folder: refined_bundle(bundle, request, devices, progress, folder)
 
 
 def _opened(

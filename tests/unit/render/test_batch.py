@@ -11,6 +11,7 @@ import v3dg
 from devices import host, on
 from frames import composed_scene
 from v3dg import BatchPlanes, Camera, CameraBatch, Scene
+from v3dg.donut import make_donut
 from v3dg.residency import residency
 
 WIDTH = 45
@@ -521,6 +522,23 @@ def test_a_large_batch_is_drawn_in_parts(scene):
         alone = v3dg.render(scene, cameras[number], tolerance=2.0, device="cuda")
         np.testing.assert_array_equal(host(batch.color[number]), host(alone.color))
         assert batch.stats.gaussians_selected[number] == alone.stats.gaussians_selected
+
+
+@pytest.mark.gpu
+@pytest.mark.slow
+def test_more_gaussians_than_a_frame_can_have_are_drawn_in_parts():
+    bundle = v3dg.build_bundle(make_donut(45_000), quality="draft", progress=False, device="cuda")
+    scene = Scene()
+    scene.add(bundle, np.random.default_rng(0).uniform(-2, 2, (100, 3)))
+    cameras = v3dg.turntable((0, 0, 0), 12.0, 64, width=16, height=16)
+    renderer = v3dg.Renderer(scene, device="cuda", memory=None)
+    batch = renderer.render_batch(cameras, tolerance=0.0)
+    assert batch.stats.gaussians_in_frustum.sum() > 1 << 28
+    assert batch.stats.num_parts > 1
+    alone = v3dg.render(scene, cameras[63], tolerance=0.0, device="cuda")
+    np.testing.assert_array_equal(host(batch.color[63]), host(alone.color))
+    again = renderer.render_batch(cameras[:2], tolerance=0.0)  # has no error of the parts before
+    np.testing.assert_array_equal(host(again.color[0]), host(batch.color[0]))
 
 
 @pytest.mark.gpu

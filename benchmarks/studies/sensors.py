@@ -1,0 +1,466 @@
+"""What do many small pictures cost beside those of other renderers, and how far is each
+from the supersampled picture?
+
+`make` builds different assets into a folder. `measure` stands them on a floor and draws
+the same cameras at eye level with a batch of v3dg, with gsplat 1.5 and, if it can be
+imported, with the vectorized renderer for Isaac Sim. The others get all gaussians in
+world space. The study needs a GPU.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import math
+import statistics
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
+
+import numpy as np
+import tyro
+
+import v3dg
+from benchmarks.evaluation import record
+from benchmarks.evaluation.measure import Judge, times_ms
+from benchmarks.ops import bench_sensors
+from benchmarks.worlds import procedural
+from v3dg import _core, metrics
+from v3dg.pictures import Picture, to_8bit
+
+if TYPE_CHECKING:
+    import torch
+
+Row: TypeAlias = dict[str, object]
+
+_PITCH = 3.0  # distance of neighbouring objects in units
+_SIDE = 2.4  # longest side of an object in units
+_AISLE = 0.25  # half the width of the aisles between objects in units
+_EYE = 0.9  # height of the cameras in units
+_SAMPLES = 8  # of a reference picture along each side of a pixel of the largest size
+_FEW = 4  # judged cameras that are drawn together
+_PEER_REPEATS = 3  # timed calls of other renderers
+_SCENE_ID = 0  # the name of the only scene of the vectorized renderer
+
+
+@dataclass
+class Make:
+    """Build the assets that are not in the folder yet."""
+
+    folder: Path
+    gaussians: int = 125_000
+    """Gaussians of an asset."""
+    quality: Literal["draft", "standard"] = "draft"
+    device: str = "cuda"
+
+
+@dataclass
+class Measure:
+    """Draw and compare."""
+
+    folder: Path
+    objects: int = 16
+    cameras: int = 256
+    judged: int = 32
+    """Cameras whose pictures are compared with supersampled ones."""
+    sizes: tuple[int, ...] = (64, 128, 256)
+    tolerances: tuple[float, ...] = (0.0, 1.0, 3.0, 6.0, 12.0, 24.0, 48.0)
+    batches: tuple[int, ...] = (64, 16, 4)
+    """Cameras that the other renderers draw in one call; the fastest counts."""
+    timed: int = 64
+    """Cameras of which the others' rate is measured."""
+    repeats: int = 7
+    device: str = "cuda"
+    output: Path | None = None
+
+
+def main(config: Make | Measure) -> None:
+    if isinstance(config, Make):
+        make(config)
+        return
+    scene = floor_of(config)
+    cameras = cameras_of(scene, config.cameras, max(config.sizes))
+    result: Row = {
+        "objects": len(scene),
+        "assets": sorted(path.stem for path in config.folder.glob("*.v3dg")),
+        "cameras": config.cameras,
+        "judged": config.judged,
+        "sh_degree": 0,
+    }
+    rows: list[Row] = []
+    result["rows"] = rows
+    for row in Comparison(config, scene, cameras).rows():
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+        record.write(config.output, result, config.device)
+
+
+def make(config: Make) -> None:
+    config.folder.mkdir(parents=True, exist_ok=True)
+    for name, asset in assets_of(config.gaussians):
+        if (config.folder / f"{name}.v3dg").exists():
+            continue
+        bundle = v3dg.build_bundle(
+            flat(asset), quality=config.quality, progress=False, device=config.device
+        )
+        bundle.write(config.folder / f"{name}.v3dg")
+        print(name, len(asset), flush=True)
+
+
+def assets_of(count: int) -> Iterator[tuple[str, v3dg.Gaussians]]:
+    """Yield 16 assets of five kinds with their names."""
+    for seed in range(4):
+        yield f"toadstools_{seed}", procedural.make_asset(count, seed=seed)
+        yield f"person_{seed}", procedural.make_person(count, seed=seed)
+    for kind in ("oak", "birch", "cherry", "spruce"):
+        yield f"tree_{kind}", procedural.make_tree(count, kind=kind)
+    for seed in range(2):
+        yield f"temple_{seed}", procedural.make_temple(count, seed=seed)
+        yield f"donut_{seed}", procedural.make_donut(count, seed=seed)
+
+
+def flat(asset: v3dg.Gaussians) -> v3dg.Gaussians:
+    """Return an asset whose colours do not depend on the view, which is what the
+    vectorized renderer can draw."""
+    return v3dg.Gaussians(
+        asset.means,
+        asset.quats,
+        asset.scales,
+        asset.opacities,
+        np.ascontiguousarray(asset.sh[:, :1]),
+    )
+
+
+def floor_of(config: Measure) -> v3dg.Scene:
+    """Return objects of one size that stand on a floor."""
+    bundles = [v3dg.Bundle.open(path) for path in sorted(config.folder.glob("*.v3dg"))]
+    scene = bench_sensors.floor_of(bundles, config.objects)
+    lows = []
+    scales = []
+    for bundle in bundles:
+        means = bundle.level_gaussians(0).means
+        low = means.min(axis=0)
+        scale = _SIDE / float((means.max(axis=0) - low).max())
+        lows.append(-scale * float(low[2]))
+        scales.append(scale)
+    turns = np.arange(config.objects) % len(bundles)
+    positions = np.array(scene.positions)
+    positions[:, 2] = np.asarray(lows)[turns]
+    scene.move(positions=positions, scales=np.asarray(scales)[turns])
+    return scene
+
+
+def cameras_of(scene: v3dg.Scene, count: int, side: int) -> list[v3dg.Camera]:
+    """Return cameras at eye level in the aisles between the objects. Each camera looks
+    at one object."""
+    rng = np.random.default_rng(1)
+    lines = np.unique(scene.positions[:, 0])
+    crossings = np.append(lines - _PITCH / 2, lines[-1] + _PITCH / 2)
+    cameras = []
+    for _ in range(count):
+        eye = np.append(rng.choice(crossings, 2) + rng.uniform(-_AISLE, _AISLE, 2), _EYE)
+        target = scene.positions[rng.integers(len(scene))] + [0, 0, _EYE / 2]
+        cameras.append(v3dg.Camera.look_at(eye, target, fov_x=1.2, width=side, height=side))
+    return cameras
+
+
+class Peer(Protocol):
+    """A renderer that draws all gaussians of a scene for a batch of cameras."""
+
+    @property
+    def name(self) -> str: ...
+
+    def draw(self, viewmats: torch.Tensor, K: torch.Tensor, size: int) -> torch.Tensor:
+        """Return pictures (B, H, W, 3) on black."""
+        ...
+
+
+@dataclass(frozen=True)
+class Gsplat:
+    """gsplat 1.5 in one of its modes."""
+
+    gaussians: v3dg.Gaussians
+    packed: bool
+    eps2d: float = 0.0
+    antialiased: bool = False
+
+    @property
+    def name(self) -> str:
+        words = ["gsplat"]
+        if self.packed:
+            words.append("packed")
+        if self.antialiased:
+            words.append("antialiased")
+        return " ".join(words)
+
+    def draw(self, viewmats: torch.Tensor, K: torch.Tensor, size: int) -> torch.Tensor:
+        import gsplat
+
+        g = self.gaussians
+        mode: Literal["classic", "antialiased"] = "classic"
+        if self.antialiased:
+            mode = "antialiased"
+        pictures: torch.Tensor
+        pictures, _, _ = gsplat.rasterization(
+            g.means,
+            g.quats,
+            g.scales,
+            g.opacities,
+            _colors(g),
+            viewmats,
+            K,
+            size,
+            size,
+            near_plane=0.01,
+            eps2d=self.eps2d,
+            packed=self.packed,
+            rasterize_mode=mode,
+        )
+        return pictures
+
+
+def _colors(gaussians: v3dg.Gaussians) -> torch.Tensor:
+    colors: torch.Tensor = (gaussians.sh[:, 0] * _core.sh_base0 + 0.5).clamp_min(0)
+    return colors
+
+
+@dataclass
+class Vectorized:
+    """The vectorized renderer for Isaac Sim: only colours, and no filter."""
+
+    gaussians: v3dg.Gaussians
+    name: str = "vectorized"
+    _services: dict[tuple[int, int], object] = field(default_factory=dict)
+
+    def draw(self, viewmats: torch.Tensor, K: torch.Tensor, size: int) -> torch.Tensor:
+        import torch
+
+        service = self._service(len(viewmats), size)
+        scene_ids = torch.full((len(viewmats),), _SCENE_ID, device=viewmats.device)
+        outputs = service.render(viewmats, K, scene_ids)  # type: ignore[attr-defined]
+        pictures: torch.Tensor = outputs["rgb"]
+        return pictures
+
+    def _service(self, count: int, size: int) -> object:
+        import torch
+
+        if (count, size) not in self._services:
+            self._services.clear()
+            module = importlib.import_module("isaacsim_gaussian_renderer")
+            backend = module.CustomCudaBackend(covariance_epsilon=0.0, output_srgb=False)
+            service = module.RendererService(
+                backend, height=size, width=size, outputs=("rgb",), max_views=count
+            )
+            service.initialize(None, "cuda")
+            g = self.gaussians
+            service.load_scene(
+                _SCENE_ID,
+                means=g.means,
+                scales=g.scales,
+                rotations=g.quats,
+                opacities=g.opacities,
+                features=_colors(g).contiguous(),
+                semantic_ids=torch.zeros(len(g), dtype=torch.int64, device="cuda"),
+            )
+            self._services[count, size] = service
+        return self._services[count, size]
+
+
+class Comparison:
+    """A scene's reference pictures, and the measurements of each renderer."""
+
+    def __init__(self, config: Measure, scene: v3dg.Scene, cameras: list[v3dg.Camera]) -> None:
+        self.config = config
+        self.cameras = cameras
+        self.renderer = v3dg.Renderer(scene, device=config.device, memory=None)
+        self.timing = bench_sensors.Config(device=config.device, repeats=config.repeats)
+        self.judge = Judge()
+        self.fine = self._fine_pictures()
+        print(f"{len(self.fine)} reference pictures", flush=True)
+        self.world = v3dg.select(
+            scene, cameras[0], tolerance=0.0, cull=False, device=config.device
+        ).gaussians(device=config.device)
+
+    def rows(self) -> Iterator[Row]:
+        """Yield a row for each size and renderer."""
+        for size in self.config.sizes:
+            for row in self._rows_of(size):
+                yield {"size": size, **row}
+        self.judge.close()
+
+    def _fine_pictures(self) -> list[Picture]:
+        """Draw all gaussians for the judged cameras, with several samples along each
+        side of a pixel of the largest size."""
+        return [
+            np.asarray(metrics.box_downsample(self._fine(camera), _SAMPLES), dtype=np.float32)
+            for camera in self.cameras[: self.config.judged]
+        ]
+
+    def _fine(self, camera: v3dg.Camera) -> Picture:
+        image = self.renderer.render(
+            camera.scaled(_SAMPLES), tolerance=0.0, min_transmittance=metrics.MIN_TRANSMITTANCE
+        )
+        color: Picture = to_numpy(image.color.clip(0, 1))
+        return color
+
+    def _truths(self, size: int) -> list[Picture]:
+        factor = max(self.config.sizes) // size
+        return [to_8bit(metrics.box_downsample(picture, factor)) for picture in self.fine]
+
+    def _rows_of(self, size: int) -> Iterator[Row]:
+        truths = self._truths(size)
+        ours = {
+            tolerance: self._ours(size, tolerance, truths) for tolerance in self.config.tolerances
+        }
+        yield from ours.values()
+        fastest_rows = []
+        for peers in self._peers():
+            rows = [row for peer in peers for row in self._peer_rows(peer, size, truths)]
+            if rows:
+                fastest_rows.append(max(rows, key=lambda row: number(row["rate"])))
+            yield from rows
+        for fastest in fastest_rows:
+            tolerance = tolerance_of_equal_error(ours, number(fastest["flip"]))
+            row = self._ours(size, tolerance, truths)
+            yield {"at_error_of": fastest["renderer"], **row}
+
+    def _peers(self) -> list[list[Peer]]:
+        """Return the modes of each other renderer that can be imported. The modes of
+        one have the same pictures."""
+        peers: list[list[Peer]] = []
+        if self.config.device == "cpu":
+            return peers
+        if importlib.util.find_spec("gsplat") is not None:
+            peers.append([Gsplat(self.world, packed) for packed in (False, True)])
+            filtered = Gsplat(self.world, packed=True, eps2d=0.3, antialiased=True)
+            peers.append([filtered])
+        if importlib.util.find_spec("isaacsim_gaussian_renderer") is not None:
+            peers.append([Vectorized(self.world)])
+        return peers
+
+    def _at(self, size: int) -> list[v3dg.Camera]:
+        factor = size / max(self.config.sizes)
+        return [at_size(camera, size, factor) for camera in self.cameras]
+
+    def _ours(self, size: int, tolerance: float, truths: list[Picture]) -> Row:
+        cameras = self._at(size)
+        if tolerance == 0:  # all gaussians, as the others are timed
+            cameras = cameras[: self.config.timed]
+        batch = bench_sensors.batch_on(cameras, self.config.device)
+        judged = self._at(size)[: len(truths)]
+        drawn = [
+            self.renderer.render_batch(
+                bench_sensors.batch_on(judged[first : first + _FEW], self.config.device),
+                tolerance=tolerance,
+            )
+            for first in range(0, len(judged), _FEW)
+        ]
+        pictures = np.concatenate([to_numpy(part.color) for part in drawn])
+        gaussians = np.concatenate([part.stats.gaussians_in_frustum for part in drawn]).mean()
+        self.renderer.render_batch(batch, tolerance=tolerance).wait()
+        rate = bench_sensors.rate(
+            lambda: self.renderer.render_batch(batch, tolerance=tolerance),
+            len(cameras),
+            self.timing,
+        )
+        return {
+            "renderer": "v3dg",
+            "tolerance": round(tolerance, 3),
+            "rate": rate,
+            "gaussians": round(float(gaussians)),
+            **self._errors(truths, pictures),
+        }
+
+    def _peer_rows(self, peer: Peer, size: int, truths: list[Picture]) -> Iterator[Row]:
+        """Yield a row for each number of cameras in a call that fits into memory."""
+        import torch
+
+        cameras = self._at(size)
+        batch = v3dg.CameraBatch.of(cameras)
+        viewmats = torch.tensor(batch.viewmats, dtype=torch.float32, device=self.config.device)
+        K = torch.tensor(batch.K, dtype=torch.float32, device=self.config.device)
+        for count in self.config.batches:
+            torch.cuda.empty_cache()
+
+            def draw(first: int, count: int = count) -> torch.Tensor:
+                last = first + count
+                return peer.draw(viewmats[first:last], K[first:last], size)
+
+            try:
+                with torch.no_grad():
+                    yield self._peer_row(peer, draw, count, truths)
+            except (RuntimeError, ValueError) as error:
+                text = " ".join(str(error).split())[:200]
+                print(f"{peer.name}, {count} cameras of {size} px: {text}", flush=True)
+
+    def _peer_row(
+        self, peer: Peer, draw: Callable[[int], torch.Tensor], count: int, truths: list[Picture]
+    ) -> Row:
+        starts = range(0, self.config.timed, count)
+        pictures = [draw(first).cpu().numpy() for first in range(0, len(truths), count)]
+
+        def draw_all() -> None:
+            for first in starts:
+                draw(first)
+
+        draw_all()
+        ms = statistics.median(times_ms(draw_all, self.config.device, _PEER_REPEATS))
+        errors = self._errors(truths, np.concatenate(pictures)[: len(truths)])
+        return {
+            "renderer": peer.name,
+            "cameras_in_a_call": count,
+            "rate": round(1e3 * self.config.timed / ms, 1),
+            **errors,
+        }
+
+    def _errors(self, truths: list[Picture], pictures: Picture) -> Row:
+        """Return the mean of FLIP and PSNR of 8-bit pictures, and the root of the mean
+        square error over all of them."""
+        pairs = [(truth, to_8bit(picture)) for truth, picture in zip(truths, pictures, strict=True)]
+        rows = self.judge.errors(pairs)
+        squares = [np.square((a.astype(np.float64) - b) / 255).mean() for a, b in pairs]
+        psnrs = [row["psnr"] for row in rows if row["psnr"] is not None]
+        return {
+            "flip": round(statistics.fmean(row["flip"] for row in rows), 5),
+            "psnr": round(statistics.fmean(psnrs), 2),
+            "rmse": round(math.sqrt(statistics.fmean(squares)), 6),
+        }
+
+
+def at_size(camera: v3dg.Camera, size: int, factor: float) -> v3dg.Camera:
+    """Return the same square camera with another resolution."""
+    K = camera.K * np.array([[factor], [factor], [1.0]])
+    return v3dg.Camera(camera.viewmat, K, size, size, camera.near)
+
+
+def number(value: object) -> float:
+    assert isinstance(value, float)
+    return value
+
+
+def to_numpy(array: v3dg.gaussians.Array) -> Picture:
+    if isinstance(array, np.ndarray):
+        return array
+    picture: Picture = array.cpu().numpy()
+    return picture
+
+
+def tolerance_of_equal_error(rows: dict[float, Row], flip: float) -> float:
+    """Return the largest tolerance at which the error is at most `flip`, interpolated
+    between measured tolerances; 0 if all errors are larger."""
+    tolerances = sorted(rows)
+    errors = [number(rows[tolerance]["flip"]) for tolerance in tolerances]
+    for index in reversed(range(len(tolerances))):
+        if errors[index] > flip:
+            continue
+        if index + 1 == len(tolerances):
+            return tolerances[index]
+        share = (flip - errors[index]) / (errors[index + 1] - errors[index])
+        return tolerances[index] + share * (tolerances[index + 1] - tolerances[index])
+    return 0.0
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Make | Measure))

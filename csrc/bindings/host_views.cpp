@@ -1,0 +1,161 @@
+// Views of gaussians without levels on the host, in float32 or float64.
+
+#include <algorithm>
+
+#include "base/parallel_for.h"
+#include "bindings/views.h"
+#include "draw/model.h"
+
+namespace v3dg::host {
+
+namespace {
+
+template <class T>
+T* zeros(const std::vector<py::ssize_t>& shape, py::object& object) {
+    const NewArray<T> array(kHost, shape);
+    std::fill(array.span.begin(), array.span.end(), T(0));
+    object = array.object;
+    return array.span.data;
+}
+
+template <class T>
+class HostViewsTape final : public ViewsTape {
+  public:
+    HostViewsTape(const std::vector<GaussianRows<const T>>& gaussians,
+                  const std::vector<Camera>& cameras, const ViewsLook& look)
+        : cameras_(cameras), look_(look), workspaces_(cameras.size()) {
+        for (const GaussianRows<const T>& rows : gaussians)
+            models_.push_back(std::make_unique<::v3dg::Model<T>>(rows));
+    }
+
+    // Each thread draws a view. All threads together draw the views that are left over.
+    void draw(T* color, T* alpha, T* depth, bool keeps_tape) {
+        const size_t num_views = cameras_.size();
+        const size_t first_left_over = num_views - num_views % most_threads();
+        std::vector<Workspace<T>> of_thread(keeps_tape ? 0 : most_threads());
+        const auto draw_view = [&](size_t view) {
+            const size_t skipped = view * num_pixels();
+            Picture<T> picture = picture_of(view);
+            picture.color = color + 3 * skipped;
+            picture.alpha = alpha + skipped;
+            if (depth != nullptr) picture.depth = depth + skipped;
+            Workspace<T>& workspace = keeps_tape ? workspaces_[view] : of_thread[thread_index()];
+            render<T>({draw_of(view)}, cameras_[view].template intrinsics<T>(), picture, keeps_tape,
+                      workspace);
+        };
+        parallel_for(first_left_over, 1, draw_view);
+        for (size_t view = first_left_over; view < num_views; ++view) draw_view(view);
+    }
+
+    Gradients backward(const py::object& d_color, const py::object& d_alpha,
+                       const py::object& d_depth, const ViewsWanted& wanted) override {
+        const auto num_views = static_cast<py::ssize_t>(cameras_.size());
+        const ViewsGradientPlanes<T> planes(kHost, {num_views, height(), width()}, d_color, d_alpha,
+                                            d_depth);
+        const auto n = static_cast<py::ssize_t>(models_[0]->size());
+        const int degree = models_[0]->planes().sh_degree;
+        const py::ssize_t bases = num_sh_bases(degree);
+        const auto shape = [&](bool for_each_view, std::vector<py::ssize_t> of_view) {
+            if (for_each_view) of_view.insert(of_view.begin(), num_views);
+            return of_view;
+        };
+        Gradients made;
+        const GaussianRows<T> sums{
+            .means = zeros<T>({n, 3}, made.means),
+            .quats = zeros<T>({n, 4}, made.quats),
+            .scales = zeros<T>({n, 3}, made.scales),
+            .opacities = zeros<T>(shape(wanted.opacities_for_each_view, {n}), made.opacities),
+            .sh = zeros<T>(shape(wanted.sh_for_each_view, {n, bases, 3}), made.sh),
+            .size = models_[0]->size(),
+            .sh_degree = degree};
+        T* const background = zeros<T>({num_views, 3}, made.background);
+        CenterGradients<T> centers{};
+        if (wanted.centers.sum) centers.sum = zeros<T>({num_views, n, 2}, made.centers);
+        if (wanted.centers.size)
+            centers.size =
+                reinterpret_cast<CenterSize<T>*>(zeros<T>({num_views, n, 2}, made.center_sizes));
+        T* const poses = wanted.poses ? zeros<T>({num_views, 3, 4}, made.poses) : nullptr;
+        const Unlocked unlocked;
+        for (size_t view = 0; view < cameras_.size(); ++view) {
+            const size_t skipped = view * sums.size;
+            GaussianRows<T> out = sums;
+            if (wanted.opacities_for_each_view) out.opacities += skipped;
+            if (wanted.sh_for_each_view) out.sh += skipped * out.num_sh();
+            CenterGradients<T> of_view = centers;
+            if (of_view.sum != nullptr) of_view.sum += 2 * skipped;
+            if (of_view.size != nullptr) of_view.size += skipped;
+            PoseSums<double> pose{};
+            const ViewSums view_sums{.pose = poses != nullptr ? &pose : nullptr};
+            const Draw<T> draw = draw_of(view);
+            render_backward<T>(draw, cameras_[view].template intrinsics<T>(), picture_of(view),
+                               planes.of_view(view), workspaces_[view], out, of_view,
+                               background + 3 * view, &view_sums);
+            if (poses != nullptr) set_pose(pose, draw.view, poses + 12 * view);
+        }
+        return made;
+    }
+
+  private:
+    py::ssize_t height() const { return static_cast<py::ssize_t>(cameras_[0].height); }
+    py::ssize_t width() const { return static_cast<py::ssize_t>(cameras_[0].width); }
+    size_t num_pixels() const { return static_cast<size_t>(height() * width()); }
+
+    Draw<T> draw_of(size_t view) const {
+        const ::v3dg::Model<T>& model = *models_[models_.size() > 1 ? view : 0];
+        return {.model = &model.planes(),
+                .first = 0,
+                .count = model.size(),
+                .view = view_of_world<T>(cameras_[view]),
+                .appearance = {T(look_.filter_px2), look_.antialiased, false}};
+    }
+
+    // Returns a picture without memory.
+    Picture<T> picture_of(size_t view) const {
+        const std::array<double, 3> background = look_.of_view(view).background;
+        return {.window = {0, 0, static_cast<int>(width()), static_cast<int>(height())},
+                .background = {T(background[0]), T(background[1]), T(background[2])},
+                .color = nullptr,
+                .alpha = nullptr,
+                .depth = nullptr};
+    }
+
+    static void set_pose(const PoseSums<double>& sums, const ModelView<T>& view, T* out) {
+        double d_pose[12];
+        pose_gradient(sums, view, d_pose);
+        for (int k = 0; k < 12; ++k) out[k] = static_cast<T>(d_pose[k]);
+    }
+
+    std::vector<std::unique_ptr<::v3dg::Model<T>>> models_;
+    std::vector<Camera> cameras_;
+    ViewsLook look_;
+    std::vector<Workspace<T>> workspaces_;
+};
+
+template <class T>
+RasterizedViews rasterize_views_as(const std::vector<Rows>& gaussians, const BoundCameras& cameras,
+                                   const ViewsLook& look, bool with_depth, bool keep_tape) {
+    const NewViews<T> made(kHost, cameras, with_depth);
+    std::vector<GaussianRows<const T>> rows;
+    for (const Rows& of_view : gaussians) rows.push_back(look.of_view(0).read<T>(of_view));
+    std::unique_ptr<HostViewsTape<T>> tape;
+    {
+        const Unlocked unlocked;
+        tape = std::make_unique<HostViewsTape<T>>(rows, cameras.on_host(), look);
+        tape->draw(made.color_plane, made.alpha_plane, made.depth_plane, keep_tape);
+    }
+    return {.color = made.color,
+            .alpha = made.alpha,
+            .depth = made.depth,
+            .tape = keep_tape ? std::move(tape) : nullptr};
+}
+
+}  // namespace
+
+RasterizedViews rasterize_views(const std::vector<Rows>& gaussians, const BoundCameras& cameras,
+                                const ViewsLook& look, bool with_depth, bool keep_tape) {
+    return gaussians[0].is_double()
+               ? rasterize_views_as<double>(gaussians, cameras, look, with_depth, keep_tape)
+               : rasterize_views_as<float>(gaussians, cameras, look, with_depth, keep_tape);
+}
+
+}  // namespace v3dg::host

@@ -1,0 +1,109 @@
+#pragma once
+
+// Pictures of gaussians without levels from several cameras ("views"), and their
+// gradients.
+
+#include "bindings/batch.h"
+#include "bindings/tape.h"
+
+namespace v3dg {
+
+// The requested gradients, besides those of all inputs.
+struct ViewsWanted {
+    Centers centers;
+    bool poses;
+    // Whether each view has its own gradients of opacities, or of SH coefficients: (V,
+    // N, ...). Other gradients are sums over views.
+    bool opacities_for_each_view, sh_for_each_view;
+};
+
+// The results of rasterize_views() that its backward pass needs.
+class ViewsTape {
+  public:
+    virtual ~ViewsTape() = default;
+    // The centres of the result are (V, N, 2), the backgrounds (V, 3).
+    virtual Gradients backward(const py::object& d_color, const py::object& d_alpha,
+                               const py::object& d_depth, const ViewsWanted& wanted) = 0;
+};
+
+// The settings of views besides gaussians and cameras.
+struct ViewsLook {
+    double filter_px2;
+    bool antialiased;
+    std::vector<std::array<double, 3>> backgrounds;  // one for all views, or one for each
+    bool plain_colors;                               // as in DrawLook
+
+    DrawLook of_view(size_t view) const {
+        return {.filter_px2 = filter_px2,
+                .antialiased = antialiased,
+                .background = backgrounds[backgrounds.size() > 1 ? view : 0],
+                .plain_colors = plain_colors};
+    }
+};
+
+// Drawn views: (V, H, W, ...). `tape` is null if not requested.
+struct RasterizedViews {
+    py::object color, alpha, depth;
+    std::unique_ptr<ViewsTape> tape;
+};
+
+// The arrays of views.
+template <class T>
+struct NewViews {
+    py::object color, alpha, depth;  // `depth` is None if not requested
+    T *color_plane, *alpha_plane, *depth_plane;
+
+    NewViews(Device device, const BoundCameras& cameras, bool with_depth) : depth(py::none()) {
+        const auto count = static_cast<py::ssize_t>(cameras.size());
+        const py::ssize_t height = cameras.height();
+        const py::ssize_t width = cameras.width();
+        const NewArray<T> new_color(device, {count, height, width, 3});
+        const NewArray<T> new_alpha(device, {count, height, width});
+        color = new_color.object;
+        alpha = new_alpha.object;
+        color_plane = new_color.span.data;
+        alpha_plane = new_alpha.span.data;
+        depth_plane = nullptr;
+        if (!with_depth) return;
+        const NewArray<T> new_depth(device, {count, height, width});
+        depth = new_depth.object;
+        depth_plane = new_depth.span.data;
+    }
+};
+
+// The gradients of the planes of views, each of `num_pixels` pixels.
+template <class T>
+struct ViewsGradientPlanes {
+    GradientPlane<T> color, alpha;
+    const T* depth;
+    size_t num_pixels;
+
+    ViewsGradientPlanes(Device device, const std::vector<py::ssize_t>& shape,
+                        const py::object& d_color, const py::object& d_alpha,
+                        const py::object& d_depth)
+        : color(d_color, "d_color", device, {shape[0], shape[1], shape[2], 3}),
+          alpha(d_alpha, "d_alpha", device, shape),
+          depth(d_depth.is_none()
+                    ? nullptr
+                    : span_on<const T>(device, d_depth, "d_depth", {shape[0], shape[1], shape[2]})
+                          .data),
+          num_pixels(static_cast<size_t>(shape[1]) * static_cast<size_t>(shape[2])) {}
+
+    PictureGradient<T> of_view(size_t view) const {
+        const size_t skipped = view * num_pixels;
+        return {color.span.data + 3 * skipped, alpha.span.data + skipped,
+                depth == nullptr ? nullptr : depth + skipped};
+    }
+};
+
+// Implementations of Backend::rasterize_views().
+namespace host {
+RasterizedViews rasterize_views(const std::vector<Rows>& gaussians, const BoundCameras& cameras,
+                                const ViewsLook& look, bool with_depth, bool keep_tape);
+}  // namespace host
+namespace cuda {
+RasterizedViews rasterize_views(const std::vector<Rows>& gaussians, const BoundCameras& cameras,
+                                const ViewsLook& look, bool with_depth, bool keep_tape);
+}  // namespace cuda
+
+}  // namespace v3dg
