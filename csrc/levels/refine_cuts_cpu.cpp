@@ -4,7 +4,6 @@
 #include "levels/refine_cuts.h"
 
 #include <algorithm>
-#include <numeric>
 #include <optional>
 #include <vector>
 
@@ -46,8 +45,8 @@ class Canvas {
     std::vector<float> values_;
 };
 
-// A cell, the sum of its pixels' differences, and sums for the window. A cell at the border of a
-// picture may have less than kCellSide columns or rows.
+// A cell, the sum of its pixels' differences, and sums for the window. A cell at the
+// border of a picture may have less than kCellSide columns or rows.
 struct Cell {
     size_t x0, y0, x1, y1;
     PixelValues sum;

@@ -97,7 +97,7 @@ struct WindowSums {
     }
 };
 
-// What the gradients of all pixels of a window have in common.
+// The common part of the gradients of a window's pixels.
 struct WindowSlopes {
     float weight;       // of the picture
     float of_means[4];  // gradient of the loss of the window's sums, without the weight
@@ -105,12 +105,12 @@ struct WindowSlopes {
     V3DG_HD float weighed(float slope, int k) const { return weight * (slope + of_means[k]); }
 };
 
-// Returns the gradient of the loss of a window's sums at each pixel. That loss is
-// linear in the difference of the sums, and quadratic where the difference is smaller
-// than kSmallMeans of the target's sum. So it hardly disturbs windows whose sums are
-// right. Without it, solids keep a rim and dark colours, because the |differences| of
-// pixels and cells are least at medians. Dark colours count as kLeastColor of alpha,
-// because nobody sees a relative error of black.
+// Sets the gradient of the loss of a window's sums at each pixel. That loss is linear in
+// the difference of the sums, and quadratic where the difference is smaller than
+// kSmallMeans of the target's sum, so that it hardly disturbs windows whose sums are
+// right. The |differences| of pixels and cells are least at medians. These are darker
+// than means, and thinner where gaussians are faint. A colour counts as at least
+// kLeastColor of alpha, because a relative error of black is not visible.
 constexpr double kSmallMeans = 0.02, kLeastColor = 0.1;
 constexpr double kLeastSum = 1e-30;  // keeps the quotient finite where the target is empty
 V3DG_HD inline void put_slopes_of_means(const LossWeights& loss, float means,
@@ -134,6 +134,7 @@ V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
 }
 
+// Returns the common part of the gradients of a window's pixels.
 V3DG_HD inline WindowSlopes slopes_of_window(const LossWeights& loss, float means,
                                              const WindowSums& sums, double num_pixels) {
     WindowSlopes slopes;

@@ -109,8 +109,8 @@ __global__ void __launch_bounds__(kThreads)
     write_block_sums(sums, sums_of_block[size_t(w) * gridDim.x + blockIdx.x]);
 }
 
-// Computes what the gradients of each window have in common from the sums of its
-// blocks. One block per window.
+// Computes the common part of the gradients of each window from the sums of its blocks.
+// One block per window.
 __global__ void __launch_bounds__(kThreads)
     weigh_kernel(const WindowTables* windows, LossWeights loss, float means,
                  const WindowSums* sums_of_block, unsigned num_blocks, WindowSlopes* slopes) {
