@@ -8,7 +8,7 @@ import pytest
 
 import v3dg
 from devices import host
-from v3dg import BuildConfig
+from v3dg import BuildConfig, _device
 from v3dg.levels import refined
 
 SAMPLES = 8
@@ -112,8 +112,9 @@ def drafts(faint_cloud, dark_ball):
 
 
 def test_refined_cuts_keep_alpha_and_colour(drafts, device):
+    pictures = 1_000 * refined.default_steps(_device.resolve(device)).windows
     for asset, bundle in drafts:
-        moved = v3dg.refine_bundle(bundle, steps=1_000, device=device, progress=False)
+        moved = v3dg.refine_bundle(bundle, steps=pictures, device=device, progress=False)
         np.testing.assert_allclose(ratios(asset, moved, 14, device), 1, atol=0.025)
 
 
