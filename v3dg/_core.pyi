@@ -1042,9 +1042,12 @@ def fit_level(
 
 # The comparison of cuts with the asset. `refine_cuts` overwrites `gaussians`.
 class CutComparison:
-    """The number of windows in a step of a refinement, and of cuts for each view."""
+    """The number of windows in a step of a refinement, and of cuts for each view, and
+    the weight of the mean differences of windows."""
 
-    def __init__(self, *, windows_per_step: int, cuts_per_view: int) -> None: ...
+    def __init__(
+        self, *, windows_per_step: int, cuts_per_view: int, window_means: float
+    ) -> None: ...
 
 def refine_cuts(
     *,
