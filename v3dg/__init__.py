@@ -25,7 +25,7 @@ from v3dg.editing import (
     join,
     to_degree,
 )
-from v3dg.export import write_site, write_streamed_sog, write_tiles, write_usd
+from v3dg.export import write_site, write_streamed_sog, write_tiles, write_usd, write_web_page
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage, Stats
 from v3dg.io import read_asset, write_asset
@@ -45,7 +45,7 @@ from v3dg.render import (
     first_camera,
     render,
 )
-from v3dg.scan import Scan, scan
+from v3dg.scan import Scan, ScanBatch, scan
 from v3dg.scene import Scene
 from v3dg.scene.file import read_scene, write_scene
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
@@ -75,6 +75,7 @@ __all__ += [
 ]
 __all__ += ["MESH", "BatchPlanes", "CameraBatch", "MeshLayer", "RenderedBatch"]
 __all__ += ["draw_panorama", "first_camera"]
-__all__ += ["EquirectangularCamera", "Lidar", "Scan", "scan"]
+__all__ += ["EquirectangularCamera", "Lidar", "Scan", "ScanBatch", "scan"]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]
 __all__ += ["read_usd_scene", "write_site", "write_streamed_sog", "write_tiles", "write_usd"]
+__all__ += ["write_web_page"]

@@ -189,6 +189,7 @@ class PageRun:
         self, *, first_page: int, first_cluster: Int64, offset: Int64, places: Int64
     ) -> None: ...
 
+def write_pages(path: str, descriptor: int, gaussians: Rows, codec: str, run: PageRun) -> Uint8: ...
 def read_pages(
     path: str, descriptor: int, out: Rows | Int32, codec: str, hashes: Uint8, run: PageRun
 ) -> None: ...
@@ -390,63 +391,66 @@ class Ellipses:
     def radii(self) -> Array: ...
 
 class RaySensor:
-    """A sensor at one pose: rays of ascending azimuths and elevations. The camera has x
-    forward, y left and z up."""
+    """A sensor without a pose: rays of ascending azimuths and elevations. `rows` and
+    `columns` are their places in the picture. The sensor has x forward, y left and z
+    up."""
 
     def __init__(
         self,
-        camera: Camera,
+        *,
         azimuth: Float64,
         elevation: Float64,
-        *,
+        rows: Int32,
+        columns: Int32,
+        near: float,
         far: float,
         spacing: float,
         min_transmittance: float,
     ) -> None: ...
 
 class Cast:
-    """The results of casting rays: arrays of H rows and W columns."""
+    """The results of casting rays at B poses: arrays of H rows and W columns, or
+    None."""
 
     @property
-    def color(self) -> Float32: ...
+    def color(self) -> Array: ...
     @property
-    def alpha(self) -> Float32: ...
+    def alpha(self) -> Array: ...
     @property
-    def range(self) -> Float32: ...
+    def range(self) -> Array: ...
     @property
-    def returns(self) -> Float32: ...
+    def intensity(self) -> Array: ...
     @property
-    def gaussians(self) -> int: ...
+    def second_range(self) -> Array: ...
     @property
-    def tolerance_px2(self) -> float: ...
+    def second_intensity(self) -> Array: ...
     @property
-    def select_ms(self) -> float: ...
-    @property
-    def records(self) -> int: ...
-    @property
-    def entries(self) -> int: ...
-    @property
-    def project_ms(self) -> float: ...
-    @property
-    def bin_ms(self) -> float: ...
-    @property
-    def blend_ms(self) -> float: ...
+    def gaussians(self) -> list[int]: ...
 
-def cast_scene(
-    scene: ResidentScene,
-    models: list[Model],
-    sensor: RaySensor,
-    rule: Rule,
-    returns: tuple[float, float] | None = None,
-) -> Cast: ...
-def cast_model(
-    model: Model,
-    sensor: RaySensor,
-    *,
-    filter_px2: float,
-    antialiased: bool,
-    returns: tuple[float, float] | None = None,
-) -> Cast: ...
+class RayFrame:
+    """Casts the rays of sensors on one device."""
+
+    def __init__(self, device: int) -> None: ...
+    def set_models(self, models: list[Model]) -> None: ...
+    def cast_scene(
+        self,
+        scene: ResidentScene,
+        sensor: RaySensor,
+        viewmats: Array,
+        rule: Rule,
+        returns: tuple[float, float] | None = None,
+    ) -> Cast: ...
+    def cast_model(
+        self,
+        model: Model,
+        sensor: RaySensor,
+        viewmats: Array,
+        *,
+        filter_px2: float,
+        antialiased: bool,
+        returns: tuple[float, float] | None = None,
+    ) -> Cast: ...
+
 def rasterize(
     gaussians: Rows,
     camera: Camera,
@@ -588,8 +592,9 @@ class Mesh:
 
     Args:
         color: (..., 3).
-        depth, coverage: (...).
-        normal: (..., 3) of length 1 or 0, or None.
+        depth, coverage: (...). On a CUDA device, `coverage` may be None: 1 where the
+            depth is positive and finite.
+        normal: (..., 3) of any length, or None.
         instance, label: (...), or None.
         is_linear: Whether colours are in linear light.
     """
@@ -599,7 +604,7 @@ class Mesh:
         *,
         color: Array,
         depth: Array,
-        coverage: Array,
+        coverage: Array | None,
         normal: Array | None = None,
         instance: Array | None = None,
         label: Array | None = None,
@@ -809,11 +814,22 @@ class BatchPlanes:
     Args:
         color: (B, H, W, 3 or 4).
         alpha: (B, H, W), or None.
-        depth: (B, H, W), or None.
+        depth, median_depth, weight: (B, H, W), or None.
+        normal: (B, H, W, 3), or None.
+        instance, label: (B, H, W) int32, or None.
     """
 
     def __init__(
-        self, color: Array, alpha: Array | None = None, depth: Array | None = None
+        self,
+        color: Array,
+        alpha: Array | None = None,
+        depth: Array | None = None,
+        *,
+        median_depth: Array | None = None,
+        normal: Array | None = None,
+        instance: Array | None = None,
+        label: Array | None = None,
+        weight: Array | None = None,
     ) -> None: ...
 
 class BatchStats:
@@ -1026,9 +1042,12 @@ def fit_level(
 
 # The comparison of cuts with the asset. `refine_cuts` overwrites `gaussians`.
 class CutComparison:
-    """The number of windows in a step of a refinement, and of cuts for each view."""
+    """The number of windows in a step of a refinement, and of cuts for each view, and
+    the weight of the mean differences of windows."""
 
-    def __init__(self, *, windows_per_step: int, cuts_per_view: int) -> None: ...
+    def __init__(
+        self, *, windows_per_step: int, cuts_per_view: int, window_means: float
+    ) -> None: ...
 
 def refine_cuts(
     *,

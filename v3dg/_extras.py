@@ -22,7 +22,7 @@ EXTRAS = {
     "fsspec": Extra("fsspec[http]>=2024.2", "files at URLs"),
     "gymnasium": Extra("gymnasium>=1.1", "environments of Gymnasium"),
     "mujoco": Extra("mujoco>=3.2", "MuJoCo"),
-    "newton": Extra("newton>=1.7", "Newton"),
+    "newton": Extra("newton>=1.8", "Newton"),
     "distributed": Extra("distributed>=2024.1", "builds on many machines"),
 }
 """Optional packages, by the names of their modules."""

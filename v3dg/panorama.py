@@ -42,6 +42,10 @@ def draw_panorama(
     is half a turn to its right. Rows are latitudes, from `up` in the first row to the
     opposite direction in the last.
 
+    `v3dg.render` draws an `EquirectangularCamera` without projecting gaussians, which
+    is exact. This function is for pictures that rays do not have: with a budget, with
+    false colours, or from a pool.
+
     The projection of a gaussian is exact in the middle of a pinhole picture and less
     exact towards its borders, above all for large gaussians close to the camera.
     Compared with pictures of 15 degrees, PSNR is 32 dB in a captured room and 34 dB in

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, TypeAlias, cast, overload
 
 import numpy as np
 
-from v3dg._numbers import Floats, check_type, floats
+from v3dg import _device
+from v3dg._device import CPU
+from v3dg._numbers import Floats, check, check_type, floats
 from v3dg.opening import File, opened
-from v3dg.render.rays import cast_rays, check_rays_device
+from v3dg.render.rays import cast_rays
 from v3dg.render.request import CutRequest
 from v3dg.spherical import Lidar, checked_pose
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
+    from v3dg._core import Cast
     from v3dg._device import Device
     from v3dg.cameras import MatrixLike
+    from v3dg.gaussians import Array
     from v3dg.scene import Subject
+
+    _Poses: TypeAlias = MatrixLike | Sequence[MatrixLike]
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One turn of a LiDAR; `Lidar` defines its returns.
+    """One turn of a LiDAR; `Lidar` defines its returns. Arrays are NumPy's, or torch
+    tensors on the CUDA device that made the scan.
 
     Attributes:
         lidar: The sensor.
@@ -39,27 +43,91 @@ class Scan:
     """
 
     lidar: Lidar
-    pose: Floats
-    range: NDArray[np.float32]
-    intensity: NDArray[np.float32]
-    second_range: NDArray[np.float32]
-    second_intensity: NDArray[np.float32]
-    alpha: NDArray[np.float32]
+    pose: Array
+    range: Array
+    intensity: Array
+    second_range: Array
+    second_intensity: Array
+    alpha: Array
     gaussians: int
 
-    def points(self) -> Floats:
+    def points(self) -> Array:
         """Return (N, 3) the places of the first returns in the world, row by row: those
-        where ``np.isfinite(scan.range)``."""
+        where the range is finite. They are in double precision, where the scan is."""
         return self._places(self.range)
 
-    def second_points(self) -> Floats:
+    def second_points(self) -> Array:
         """Return (M, 3) the places of the second returns in the world."""
         return self._places(self.second_range)
 
-    def _places(self, ranges: NDArray[np.float32]) -> Floats:
-        is_hit = np.isfinite(ranges)
-        places = self.lidar.directions[is_hit] * ranges[is_hit].astype(np.float64)[:, None]
-        return np.asarray(places @ self.pose[:3, :3].T + self.pose[:3, 3])
+    def _places(self, ranges: Array) -> Array:
+        directions: Array = self.lidar.directions
+        pose = self.pose
+        is_hit: Array
+        if isinstance(ranges, np.ndarray):
+            is_hit = np.isfinite(ranges)
+            distances = ranges[is_hit].astype(np.float64)
+        else:
+            import torch
+
+            is_hit = torch.isfinite(ranges)
+            distances = ranges[is_hit].double()
+            directions = torch.as_tensor(directions, device=ranges.device)
+            pose = torch.as_tensor(pose, dtype=torch.float64, device=ranges.device)
+        places = directions[is_hit] * distances[:, None]
+        return places @ pose[:3, :3].T + pose[:3, 3]
+
+
+class ScanBatch(Sequence[Scan]):
+    """Scans at B poses: a sequence of `Scan`, whose arrays are parts of those of the
+    batch.
+
+    Attributes:
+        lidar: The sensor.
+        poses: (B, 4, 4) sensor to world.
+        range, intensity, second_range, second_intensity, alpha: (B, H, W) as in `Scan`.
+        gaussians: Number of gaussians in the selected clusters at each pose.
+    """
+
+    def __init__(self, lidar: Lidar, poses: Array, casts: Sequence[Cast]) -> None:
+        self.lidar = lidar
+        self.poses = poses
+        self.range = _joined([cast.range for cast in casts])
+        self.intensity = _joined([cast.intensity for cast in casts])
+        self.second_range = _joined([cast.second_range for cast in casts])
+        self.second_intensity = _joined([cast.second_intensity for cast in casts])
+        self.alpha = _joined([cast.alpha for cast in casts])
+        self.gaussians = [count for cast in casts for count in cast.gaussians]
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def __repr__(self) -> str:
+        rows, columns = self.alpha.shape[1:]
+        return f"ScanBatch({len(self)} scans of {rows} x {columns} rays)"
+
+    @overload
+    def __getitem__(self, number: int) -> Scan: ...
+    @overload
+    def __getitem__(self, number: slice) -> list[Scan]: ...
+    def __getitem__(self, number: int | slice) -> Scan | list[Scan]:
+        if isinstance(number, slice):
+            return [self[index] for index in range(*number.indices(len(self)))]
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"number: expected one of {len(self)} scans, got {number}")
+        return Scan(
+            lidar=self.lidar,
+            pose=self.poses[number],
+            range=self.range[number],
+            intensity=self.intensity[number],
+            second_range=self.second_range[number],
+            second_intensity=self.second_intensity[number],
+            alpha=self.alpha[number],
+            gaussians=self.gaussians[number],
+        )
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self[number] for number in range(len(self)))
 
 
 @overload
@@ -81,55 +149,99 @@ def scan(
     tolerance: float | None = None,
     min_level: int = 0,
     device: str | Device = "auto",
-) -> list[Scan]: ...
+) -> ScanBatch: ...
 def scan(
     subject: Subject | File,
     lidar: Lidar,
-    pose: MatrixLike | Sequence[MatrixLike],
+    pose: _Poses,
     *,
     tolerance: float | None = None,
     min_level: int = 0,
     device: str | Device = "auto",
-) -> Scan | list[Scan]:
+) -> Scan | ScanBatch:
     """Scan a scene, a bundle or an asset with a LiDAR at a pose, or at each of several.
 
     All rays of a scan start at the same place at the same time. Gaussians are evaluated
     on the rays and not projected.
 
+    On a CUDA device, all gaussians are resident, and buffers are kept with the scene or
+    the bundle and reused by its next scans. The call waits once for each group of poses
+    whose gaussians are cast together; the last of its work may be in progress on
+    torch's current stream when it returns.
+
     Args:
         subject: What to scan, in world space; or its file, which every call opens
             again.
         pose: (4, 4) sensor to world, a rotation and a translation; or (B, 4, 4). The
-            sensor has x forward (azimuth 0), y left and z up.
+            sensor has x forward (azimuth 0), y left and z up. Torch tensors of float32
+            or float64 on the CUDA device that scans stay there and are not checked: a
+            sensor whose pose is no rigid motion sees nothing.
         tolerance, min_level: As in `v3dg.select`, with `Lidar.spacing` as the size of a
             pixel.
-        device: "cpu" or "auto". A CUDA device is an error, because scans are made on
-            the CPU only.
+        device: As in `v3dg.render`.
 
     Raises:
         ValueError: An argument is invalid.
+        RuntimeError: `device` is "cuda", and something that CUDA needs is missing; or a
+            CUDA graph is being captured.
     """
     check_type("lidar", lidar, Lidar, "a Lidar")
-    check_rays_device(device)
+    chosen_device = _device.resolve(device)
     content: Subject = opened(subject)
     cut = CutRequest(tolerance=tolerance, min_level=min_level)
-    matrices = floats(pose, "pose")
-    if matrices.ndim != 3:
-        return _scan(content, lidar, checked_pose(matrices, "pose"), cut)
-    poses = [checked_pose(matrix, f"pose[{number}]") for number, matrix in enumerate(matrices)]
-    return [_scan(content, lidar, matrix, cut) for matrix in poses]
+    poses, is_one = _poses_of(pose, chosen_device)
+    returns = lidar.detection, lidar.gap
+    viewmats = _viewmats(poses)
+    size = max(1, len(poses))
+    if not chosen_device.is_cuda:
+        size = 1  # so that the program can be interrupted between poses
+    casts = [
+        cast_rays(content, lidar.core, viewmats[first : first + size], cut, chosen_device, returns)
+        for first in range(0, max(1, len(poses)), size)
+    ]
+    batch = ScanBatch(lidar, poses, casts)
+    if is_one:
+        return batch[0]
+    return batch
 
 
-def _scan(subject: Subject, lidar: Lidar, pose: Floats, cut: CutRequest) -> Scan:
-    cast = cast_rays(subject, lidar.core_at(pose), cut, (lidar.detection, lidar.gap))
-    returns = lidar.table.in_order(cast.returns)
-    return Scan(
-        lidar=lidar,
-        pose=pose,
-        range=np.ascontiguousarray(returns[:, :, 0, 0]),
-        intensity=np.ascontiguousarray(returns[:, :, 0, 2]),
-        second_range=np.ascontiguousarray(returns[:, :, 1, 0]),
-        second_intensity=np.ascontiguousarray(returns[:, :, 1, 2]),
-        alpha=lidar.table.in_order(cast.alpha),
-        gaussians=cast.gaussians,
-    )
+def _poses_of(pose: _Poses, device: Device) -> tuple[Array, bool]:
+    """Return (B, 4, 4) poses, and whether there is only one that is no batch."""
+    if not getattr(pose, "is_cuda", False):
+        matrices = floats(pose, "pose")
+        if matrices.ndim != 3:
+            return checked_pose(matrices, "pose")[None], True
+        for number, matrix in enumerate(matrices):
+            checked_pose(matrix, f"pose[{number}]")
+        return matrices, False
+    tensor = cast("Array", pose).detach()
+    shape = tuple(tensor.shape)
+    expected = f"shape (4, 4) or (B, 4, 4), got {shape}"
+    check("pose", shape[-2:] == (4, 4) and len(shape) in (2, 3), expected)
+    expected = f"float32 or float64, got {tensor.dtype}"
+    check("pose", str(tensor.dtype) in ("torch.float32", "torch.float64"), expected)
+    of_tensor = _device.of(tensor)
+    expected = f"a tensor on {device}, which scans, got one on {of_tensor}"
+    check("pose", of_tensor == device and device != CPU, expected)
+    return tensor.reshape(-1, 4, 4), len(shape) == 2
+
+
+def _joined(planes: list[Array]) -> Array:
+    if len(planes) == 1:
+        return planes[0]
+    return np.concatenate(planes)
+
+
+def _viewmats(poses: Array) -> Array:
+    """Return (B, 4, 4) the inverses of poses, in double precision."""
+    if isinstance(poses, np.ndarray):
+        viewmats: Floats = poses.copy()
+        viewmats[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+        viewmats[:, :3, 3] = -np.einsum("bij,bj->bi", viewmats[:, :3, :3], poses[:, :3, 3])
+        return viewmats
+    viewmats_on_device = poses.double().clone()
+    rotations = viewmats_on_device[:, :3, :3].mT.clone()
+    places = viewmats_on_device[:, :3, 3:].clone()
+    viewmats_on_device[:, :3, :3] = rotations
+    viewmats_on_device[:, :3, 3:] = -(rotations * places.mT).sum(2, keepdim=True)
+    return viewmats_on_device

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _core
 from v3dg._numbers import Floats, check, floats, positive, real, vector, whole
@@ -22,19 +23,19 @@ MIN_TRANSMITTANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class RayTable:
-    """Rays in ascending order for the core, and the way back.
+    """Rays in ascending order for the core, and their places in the picture.
 
     Attributes:
         azimuth: (W,) radians in [0, 2π), ascending.
         elevation: (H,) radians, ascending.
-        columns: (W,) where the azimuth of each column of the sensor is.
-        rows: (H,) where the elevation of each row of the sensor is.
+        columns: (W,) the column of the picture for each azimuth.
+        rows: (H,) the row of the picture for each elevation.
     """
 
     azimuth: Floats
     elevation: Floats
-    columns: np.ndarray[tuple[int], np.dtype[np.int64]]
-    rows: np.ndarray[tuple[int], np.dtype[np.int64]]
+    columns: NDArray[np.int32]
+    rows: NDArray[np.int32]
 
     @classmethod
     def of(cls, azimuth: Floats, elevation: Floats) -> "RayTable":
@@ -46,13 +47,22 @@ class RayTable:
         return cls(
             azimuth=turned[column_order],
             elevation=elevation[row_order],
-            columns=np.argsort(column_order, kind="stable"),
-            rows=np.argsort(row_order, kind="stable"),
+            columns=column_order.astype(np.int32),
+            rows=row_order.astype(np.int32),
         )
 
-    def in_order(self, plane: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> np.ndarray:
-        """Return a plane (H, W, ...) of the core in the order of the sensor."""
-        return np.ascontiguousarray(plane[self.rows[:, None], self.columns])
+    def core(self, near: float, far: float, spacing: float) -> _core.RaySensor:
+        """Return the rays for the compiled operations."""
+        return _core.RaySensor(
+            azimuth=self.azimuth,
+            elevation=self.elevation,
+            rows=self.rows,
+            columns=self.columns,
+            near=near,
+            far=far,
+            spacing=spacing,
+            min_transmittance=MIN_TRANSMITTANCE,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +151,13 @@ class EquirectangularCamera:
 
     @cached_property
     def core(self) -> _core.RaySensor:
-        """The camera for the compiled operations."""
-        viewmat = _SENSOR_FROM_CAMERA @ self.viewmat
-        return sensor_core(viewmat, self.table, self.near, math.inf, 2 * math.pi / self.width)
+        """The rays of the pixels for the compiled operations."""
+        return self.table.core(self.near, math.inf, 2 * math.pi / self.width)
+
+    @property
+    def sensor_viewmat(self) -> Floats:
+        """(4, 4) world to the sensor of the core."""
+        return np.asarray(_SENSOR_FROM_CAMERA @ self.viewmat)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,13 +232,11 @@ class Lidar:
         )
         return np.stack([across * np.cos(self.azimuth), across * np.sin(self.azimuth), height], 2)
 
-    def core_at(self, pose: Floats) -> _core.RaySensor:
-        """Return the sensor at a pose (4, 4) for the compiled operations."""
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = pose[:3, :3].T
-        viewmat[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    @cached_property
+    def core(self) -> _core.RaySensor:
+        """The rays for the compiled operations."""
         assert self.spacing is not None
-        return sensor_core(viewmat, self.table, self.near, self.far, self.spacing)
+        return self.table.core(self.near, self.far, self.spacing)
 
 
 def checked_pose(pose: object, name: str) -> Floats:
@@ -235,24 +247,6 @@ def checked_pose(pose: object, name: str) -> Floats:
     expected = "a rotation in the upper left 3x3, got a matrix that scales, shears or mirrors"
     check(name, is_rotation(matrix[:3, :3]), expected)
     return matrix
-
-
-def sensor_core(
-    viewmat: Floats, table: RayTable, near: float, far: float, spacing: float
-) -> _core.RaySensor:
-    """Return a sensor whose axes are x forward, y left and z up."""
-    # A pinhole has the square of its focal length as px² per steradian at its axis.
-    focal = 1 / spacing
-    K = np.array([[focal, 0, 0], [0, focal, 0], [0, 0, 1]])
-    camera = _core.Camera(viewmat=viewmat, K=K, width=1, height=1, near=near)
-    return _core.RaySensor(
-        camera,
-        table.azimuth,
-        table.elevation,
-        far=far,
-        spacing=spacing,
-        min_transmittance=MIN_TRANSMITTANCE,
-    )
 
 
 def _angles(values: Sequence[float] | Floats, name: str, limit: float) -> Floats:

@@ -3,7 +3,8 @@ one after another.
 
 The scenes are copies of one made asset on a floor, seen at eye level: a few objects, a
 crowd, and environments with a camera each, whose instances move in every step. On the
-CPU only the first is measured.
+CPU only the first is measured. A captured room with a robot of triangles is seen by
+fewer cameras, with every channel.
 """
 
 from __future__ import annotations
@@ -21,9 +22,15 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
-from benchmarks.worlds.procedural import make_asset
+from benchmarks.ops._robot import draw_robot
+from benchmarks.worlds.procedural import make_asset, make_room
+from v3dg.gaussians import Array
+from v3dg.render import Channel
 
 Row: TypeAlias = dict[str, float]
+
+# The channels of the room: colour and these.
+SENSED: tuple[Channel, ...] = ("depth", "normal", "instance", "label")
 
 
 @dataclass
@@ -40,17 +47,25 @@ class Config:
     environments: int = 1024
     instances: int = 8
     """Instances of each environment."""
+    room: int = 5_500_000
+    """Gaussians of the room; 0 leaves it out."""
+    room_cameras: int = 64
+    room_size: int = 128
+    only_room: bool = False
     repeats: int = 7
     output: str | None = None
 
 
 def main(config: Config) -> None:
-    bundles = make_bundles(config)
     result: dict[str, object] = {"cameras": config.cameras, "gaussians": config.gaussians}
-    result["objects"] = sizes_of(floor_of(bundles, config.objects), config)
-    if config.device == "cuda":
-        result["crowd"] = sizes_of(floor_of(bundles, config.crowd), config)
-        result["environments"] = environments_of(bundles[0], config)
+    if not config.only_room:
+        bundles = make_bundles(config)
+        result["objects"] = sizes_of(floor_of(bundles, config.objects), config)
+        if config.device == "cuda":
+            result["crowd"] = sizes_of(floor_of(bundles, config.crowd), config)
+            result["environments"] = environments_of(bundles[0], config)
+    if config.room > 0:
+        result["room"] = room_of(config)
     for name, rows in result.items():
         print(name, rows, flush=True)
     record.write(config.output, result, config.device)
@@ -156,6 +171,99 @@ def environments_of(bundle: v3dg.Bundle, config: Config) -> Row:
         step()
     gaussians = renderer.render_batch(batch).stats.gaussians_in_frustum.mean()
     return {"gaussians": float(gaussians), "batch": rate(step, config.environments, config)}
+
+
+def room_of(config: Config) -> Row:
+    """A robot of triangles in a captured room: pictures a second without and with
+    channels and the robot's z-buffer, into planes of the caller, and replayed as a
+    graph on a GPU."""
+    start = time.perf_counter()
+    room = make_room(config.room)
+    made = time.perf_counter()
+    # A draft, because refining millions of gaussians takes longer than the measurement.
+    bundle = v3dg.build_bundle(room, progress=False, device=config.device, quality="draft")
+    built = time.perf_counter()
+    print(f"room made in {made - start:.1f} s, built in {built - made:.1f} s", flush=True)
+    scene = v3dg.Scene()
+    scene.add(bundle, label=3)
+    cameras = cameras_in_room(config.room_cameras, config.room_size)
+    batch = batch_on(cameras, config.device)
+    mesh = draw_robot(cameras, config.device)
+    renderer = v3dg.Renderer(scene, device=config.device, memory=None)
+    planes = planes_of(config)
+    row: Row = {"make_s": made - start, "build_s": built - made}
+    row["gaussians"] = float(renderer.render_batch(batch).stats.gaussians_in_frustum.mean())
+    row["robot"] = float((mesh.depth > 0).sum()) / (config.room_cameras * config.room_size**2)
+
+    def draw_all() -> v3dg.RenderedBatch:
+        return renderer.render_batch(batch, channels=SENSED, mesh=mesh, out=planes)
+
+    draws: dict[str, Callable[[], object]] = {
+        "color": lambda: renderer.render_batch(batch, out=v3dg.BatchPlanes(planes.color)),
+        "depth": lambda: renderer.render_batch(batch, depth=True),
+        "mesh": lambda: renderer.render_batch(batch, mesh=mesh),
+        "ids": lambda: renderer.render_batch(batch, channels=("instance",)),
+        "normal": lambda: renderer.render_batch(batch, channels=("normal",)),
+        "sensed": lambda: renderer.render_batch(batch, channels=SENSED),
+        "all": draw_all,
+    }
+    for name, draw in draws.items():
+        row[name] = rate(draw, config.room_cameras, config)
+        print("room", name, row[name], flush=True)
+    if config.device == "cuda":
+        row["graph"] = graph_rate(draw_all, config)
+    return row
+
+
+def graph_rate(draw: Callable[[], v3dg.RenderedBatch], config: Config) -> float:
+    """Pictures a second of a captured graph."""
+    import torch
+
+    for _ in range(3):
+        draw().wait()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = draw()
+    measured = rate(graph.replay, config.room_cameras, config)
+    captured.wait()
+    return measured
+
+
+def planes_of(config: Config) -> v3dg.BatchPlanes:
+    """Planes of the caller for every channel of the room."""
+    shape = (config.room_cameras, config.room_size, config.room_size)
+    return v3dg.BatchPlanes(
+        empty((*shape, 3), config.device),
+        empty(shape, config.device),
+        empty(shape, config.device),
+        normal=empty((*shape, 3), config.device),
+        instance=empty(shape, config.device, "int32"),
+        label=empty(shape, config.device, "int32"),
+    )
+
+
+def empty(shape: tuple[int, ...], device: str, dtype: str = "float32") -> Array:
+    if device == "cpu":
+        return np.zeros(shape, dtype)
+    import torch
+
+    return torch.zeros(shape, dtype=getattr(torch, dtype), device=device)
+
+
+def cameras_in_room(count: int, size: int) -> list[v3dg.Camera]:
+    """Cameras at the height of robots' heads, which look around the room or at the
+    robot in its middle."""
+    rng = np.random.default_rng(3)
+    cameras = []
+    for number in range(count):
+        angle = rng.uniform(0, 2 * np.pi)
+        eye = np.array([1.9 * np.cos(angle), 1.5 * np.sin(angle), rng.uniform(0.9, 1.6)])
+        target = np.array([*rng.uniform(-0.4, 0.4, 2), 0.8])
+        if number % 2 == 1:
+            target = eye + rng.normal(size=3) * [1, 1, 0.3]
+        view = v3dg.Camera.look_at(eye, target, fov_x=1.2, width=size, height=size, near=0.01)
+        cameras.append(view)
+    return cameras
 
 
 def batch_on(cameras: list[v3dg.Camera], device: str) -> v3dg.CameraBatch:

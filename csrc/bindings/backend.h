@@ -231,6 +231,9 @@ class Target {
                              FitProgress& progress, const Work& work) const = 0;
 };
 
+// Casts the rays of sensors (bindings/rays.h).
+class RayFrame;
+
 }  // namespace backend
 
 class Backend {
@@ -317,6 +320,7 @@ class Backend {
     virtual std::unique_ptr<backend::AssetFrame> make_asset_frame(
         std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
         const Work& work) const = 0;
+    virtual std::unique_ptr<backend::RayFrame> make_ray_frame(const Work& work) const = 0;
     virtual std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                          bool antialiased) const = 0;
 

@@ -20,6 +20,9 @@ struct Reals {
     bool are_double;
 };
 
+// Borrows an array of float64 or, on a device, of float32.
+Reals reals_of(Device device, const py::object& array, const char* name, Shape shape);
+
 // B cameras of one size. The arrays are on the host or on one device. They are read
 // when a batch is drawn, so they may change in place between batches.
 class BoundCameras {
@@ -63,8 +66,9 @@ class BoundCameras {
 class BoundPlanes {
   public:
     // color: (B, H, W, 3 or 4). alpha, depth: (B, H, W), or None. With four channels,
-    // alpha must be None.
-    BoundPlanes(py::object color, py::object alpha, py::object depth);
+    // alpha must be None. channels: (B, H, W), normals (B, H, W, 3), or None; without
+    // `clipped`.
+    BoundPlanes(py::object color, py::object alpha, py::object depth, NewChannels channels);
     // Makes arrays of colour with three channels, of alpha and, if requested, of depth.
     BoundPlanes(const BoundCameras& cameras, Device device, bool with_depth);
 
@@ -72,14 +76,22 @@ class BoundPlanes {
     const py::object& alpha() const { return alpha_; }
     const py::object& depth() const { return depth_; }
     const BatchPlanes& planes() const { return planes_; }
+    const NewChannels& channels() const { return channels_; }
+    const SensorPlanes& sensor_planes() const { return sensor_planes_; }
     // Throws ValueError unless the planes fit these cameras and are on this device.
     void check(const BoundCameras& cameras, Device device) const;
 
   private:
+    // Returns a plane of the caller with numbers of one type; null for None.
+    template <class T>
+    T* plane_of(const py::object& array, const char* name) const;
+
     py::object color_, alpha_, depth_;
+    NewChannels channels_;
     Device device_;
     py::ssize_t count_, height_, width_;
     BatchPlanes planes_{};
+    SensorPlanes sensor_planes_{};
 };
 
 // The statistics of each picture of a batch.

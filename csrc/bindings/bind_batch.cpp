@@ -15,13 +15,6 @@ bool has_dtype(const py::object& array, const char* name) {
     return dtype == name || dtype == std::string("torch.") + name;
 }
 
-// Borrows an array of float64 or, on a device, of float32.
-Reals reals_of(Device device, const py::object& array, const char* name, Shape shape) {
-    if (device != kHost && has_dtype(array, "float32"))
-        return {.data = span_on<const float>(device, array, name, shape).data, .are_double = false};
-    return {.data = span_on<const double>(device, array, name, shape).data, .are_double = true};
-}
-
 const char* expected_of(CameraFault fault) {
     switch (fault) {
         case CameraFault::not_finite: return "finite numbers";
@@ -46,6 +39,12 @@ py::object fault_of_cameras(const py::array& viewmats, const py::array& K) {
 }
 
 }  // namespace
+
+Reals reals_of(Device device, const py::object& array, const char* name, Shape shape) {
+    if (device != kHost && has_dtype(array, "float32"))
+        return {.data = span_on<const float>(device, array, name, shape).data, .are_double = false};
+    return {.data = span_on<const double>(device, array, name, shape).data, .are_double = true};
+}
 
 BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int height, double near,
                            py::object environments,
@@ -97,10 +96,17 @@ std::vector<Camera> BoundCameras::on_host() const {
     return cameras;
 }
 
-BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth)
+template <class T>
+T* BoundPlanes::plane_of(const py::object& array, const char* name) const {
+    if (array.is_none()) return nullptr;
+    return span_on<T>(device_, array, name, {count_, height_, width_}).data;
+}
+
+BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth, NewChannels channels)
     : color_(std::move(color)),
       alpha_(std::move(alpha)),
       depth_(std::move(depth)),
+      channels_(std::move(channels)),
       device_(device_of(color_, "color")) {
     const std::vector<py::ssize_t> shape = shape_of(color_, "color");
     const bool fits = shape.size() == 4 && (shape[3] == 3 || shape[3] == 4);
@@ -115,12 +121,17 @@ BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth)
         refuse_value("alpha", "colour has alpha as its fourth channel; leave it out");
     planes_.color =
         span_on<float>(device_, color_, "color", {count_, height_, width_, shape[3]}).data;
-    const auto plane = [&](const py::object& array, const char* name) -> float* {
-        if (array.is_none()) return nullptr;
-        return span_on<float>(device_, array, name, {count_, height_, width_}).data;
-    };
-    planes_.alpha = plane(alpha_, "alpha");
-    planes_.depth = plane(depth_, "depth");
+    planes_.alpha = plane_of<float>(alpha_, "alpha");
+    planes_.depth = plane_of<float>(depth_, "depth");
+    sensor_planes_ = {.median_depth = plane_of<float>(channels_.median_depth, "median_depth"),
+                      .normal = nullptr,
+                      .instance = plane_of<int32_t>(channels_.instance, "instance"),
+                      .label = plane_of<int32_t>(channels_.label, "label"),
+                      .weight = plane_of<float>(channels_.weight, "weight"),
+                      .clipped = nullptr};
+    if (!channels_.normal.is_none())
+        sensor_planes_.normal =
+            span_on<float>(device_, channels_.normal, "normal", {count_, height_, width_, 3}).data;
 }
 
 BoundPlanes::BoundPlanes(const BoundCameras& cameras, Device device, bool with_depth)
@@ -161,8 +172,21 @@ void bind_batch(py::module_& m) {
              "environments"_a = py::none(), "lenses"_a = py::none())
         .def("__len__", &BoundCameras::size);
     py::class_<BoundPlanes>(m, "BatchPlanes", "The planes of a batch; keeps the arrays.")
-        .def(py::init<py::object, py::object, py::object>(), "color"_a, "alpha"_a = py::none(),
-             "depth"_a = py::none());
+        .def(py::init([](py::object color, py::object alpha, py::object depth,
+                         py::object median_depth, py::object normal, py::object instance,
+                         py::object label, py::object weight) {
+                 NewChannels channels;
+                 channels.median_depth = std::move(median_depth);
+                 channels.normal = std::move(normal);
+                 channels.instance = std::move(instance);
+                 channels.label = std::move(label);
+                 channels.weight = std::move(weight);
+                 return BoundPlanes(std::move(color), std::move(alpha), std::move(depth),
+                                    std::move(channels));
+             }),
+             "color"_a, "alpha"_a = py::none(), "depth"_a = py::none(), py::kw_only(),
+             "median_depth"_a = py::none(), "normal"_a = py::none(), "instance"_a = py::none(),
+             "label"_a = py::none(), "weight"_a = py::none());
     py::class_<BatchStats>(m, "BatchStats", "The statistics of each picture of a batch.")
         .def_readonly("gaussians", &BatchStats::gaussians)
         .def_readonly("in_frustum", &BatchStats::in_frustum)

@@ -2,6 +2,7 @@
 // together.
 
 #include <algorithm>
+#include <cfloat>
 #include <memory>
 
 #include "bindings/backend.h"
@@ -151,14 +152,17 @@ class BoundPictures {
     CutPictures pictures_;
 };
 
-CutComparison make_comparison(int windows_per_step, int cuts_per_view) {
+CutComparison make_comparison(int windows_per_step, int cuts_per_view, float window_means) {
     if (windows_per_step < 1 || windows_per_step > kMostWindows)
         refuse_value("windows_per_step", "expected 1 to " + std::to_string(kMostWindows) +
                                              ", got " + std::to_string(windows_per_step));
     if (cuts_per_view < 1 || cuts_per_view > int(kViewSlots))
         refuse_value("cuts_per_view", "expected 1 to " + std::to_string(kViewSlots) + ", got " +
                                           std::to_string(cuts_per_view));
-    return {windows_per_step, cuts_per_view};
+    if (!(window_means >= 0 && window_means <= FLT_MAX))
+        refuse_value("window_means",
+                     "expected a finite number of at least 0, got " + std::to_string(window_means));
+    return {windows_per_step, cuts_per_view, window_means};
 }
 
 void refine_cuts_arrays(const FitConfig& config, const CutComparison& comparison,
@@ -290,7 +294,8 @@ void bind_fit_level(py::module_& m) {
     py::class_<CutComparison>(m, "CutComparison",
                               "How a refinement compares cuts with the "
                               "asset.")
-        .def(py::init(&make_comparison), py::kw_only(), "windows_per_step"_a, "cuts_per_view"_a);
+        .def(py::init(&make_comparison), py::kw_only(), "windows_per_step"_a, "cuts_per_view"_a,
+             "window_means"_a);
     m.def("refine_cuts", &refine_cuts_arrays, py::kw_only(), "config"_a, "comparison"_a, "target"_a,
           "gaussians"_a, "radius"_a, "pictures"_a, "progress"_a,
           "Moves the gaussians of all levels, in place, so that pictures of cuts match pictures "

@@ -76,12 +76,12 @@ void check_clipped(const SensorRequest& request, const Camera& camera) {
 }
 
 // Returns the request for channels and meshes in pictures of these eyes. `sensor` is a
-// BoundSensor or None; its mesh must be on the device.
-SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes, Device device) {
+// BoundSensor or None.
+SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes) {
     if (sensor.is_none()) return {};
     const Window window = window_of(eyes.camera[0]);
     const SensorRequest request =
-        held<BoundSensor>(sensor, "sensor").request(device, {window.height(), window.width()});
+        held<BoundSensor>(sensor, "sensor").request({window.height(), window.width()});
     if (request.mesh.is_there() && eyes.are_two)
         throw py::value_error("mesh: expected one camera, got two eyes; draw each eye separately");
     check_clipped(request, eyes.camera[0]);
@@ -107,7 +107,7 @@ struct BoundRequest {
           cluster_colors(look == nullptr ? py::object() : py::object(look->cluster_colors)),
           sensor(std::move(channels)) {
         check_footprint(plain.eyes, plain.rule);
-        plain.sensor = sensor_of(sensor, plain.eyes, kHost);
+        plain.sensor = sensor_of(sensor, plain.eyes);
         if (given != nullptr && plain.eyes.are_two)
             throw py::value_error(
                 "cut: expected one camera, got two eyes; draw each eye separately");
@@ -139,13 +139,16 @@ struct BoundRequest {
     }
 };
 
-// Throws ValueError if channels and meshes of a scene, or the channel `clipped`, are
-// requested on a device that cannot draw them.
-void check_sensor(Device device, const SensorRequest& sensor) {
-    if (sensor.is_on() && backend_of(device).traits.draws_only_plainly)
+// Throws ValueError if a device cannot draw the channels, or if the mesh is on another
+// device. `sensor` is a BoundSensor or None.
+void check_sensor(Device device, const py::object& sensor) {
+    if (sensor.is_none()) return;
+    const auto& bound = held<BoundSensor>(sensor, "sensor");
+    bound.check_device(device);
+    if (bound.channels().clipped && backend_of(device).traits.draws_only_plainly)
         throw py::value_error(
-            "channels, mesh: for scenes, and 'clipped' for assets, supported only on the CPU so "
-            "far; draw with device='cpu'");
+            "channels: 'clipped' is drawn only on the CPU; leave it out, or draw with "
+            "device='cpu'");
 }
 
 // Draws scenes on one device. The frame's models belong to the bundles of the scenes,
@@ -221,8 +224,9 @@ class BoundSceneFrame {
         std::optional<BoundPlanes> new_planes;
         if (planes == nullptr) planes = &new_planes.emplace(cameras, device_, shade.with_depth);
         planes->check(cameras, device_);
-        NewChannels channels;
-        const Sensor sensor = sensor_of_batch(sensor_object, cameras, channels);
+        NewChannels channels = planes->channels();
+        const Sensor sensor =
+            sensor_of_batch(sensor_object, cameras, planes->sensor_planes(), channels);
         const BatchRequest request{.rule = rule,
                                    .shade = shade,
                                    .width = cameras.width(),
@@ -261,16 +265,17 @@ class BoundSceneFrame {
     }
 
   private:
-    // Returns the meshes and new planes for the channels of a batch.
+    // Returns the meshes and the planes for the channels of a batch: those of the
+    // caller, and new ones for other channels that are requested.
     Sensor sensor_of_batch(const py::object& sensor, const BoundCameras& cameras,
-                           NewChannels& channels) const {
-        if (sensor.is_none()) return {};
+                           const SensorPlanes& planes, NewChannels& channels) const {
+        if (sensor.is_none()) return {.planes = planes, .mesh = {}};
+        check_sensor(device_, sensor);
         const std::vector<py::ssize_t> shape{static_cast<py::ssize_t>(cameras.size()),
                                              cameras.height(), cameras.width()};
-        const SensorRequest request = held<BoundSensor>(sensor, "sensor").request(kHost, shape);
-        check_sensor(device_, request);
+        const SensorRequest request = held<BoundSensor>(sensor, "sensor").request(shape);
         for (const Camera& camera : cameras.lenses()) check_clipped(request, camera);
-        return {.planes = channels.allocate(device_, request.channels, shape),
+        return {.planes = channels.allocate(device_, request.channels, shape, planes),
                 .mesh = request.mesh};
     }
 
@@ -302,7 +307,7 @@ class BoundSceneFrame {
         const FrameRequest& request = completed ? *completed : bound.plain;
         if (has_pool && request.cut)
             throw py::value_error("cut: a pool selects its own cut; leave out `cut`");
-        check_sensor(device_, request.sensor);
+        check_sensor(device_, bound.sensor);
         if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
             throw py::value_error(
                 "shows, colors, chooser, aside: these are supported only on the CPU; leave "
@@ -365,11 +370,11 @@ class BoundAssetFrame {
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
                                        const Stop* stop, const py::object& sensor_object) {
-        const SensorRequest sensor = sensor_of(sensor_object, camera.camera, device_);
-        if (sensor.channels.clipped) check_sensor(device_, sensor);
+        const SensorRequest sensor = sensor_of(sensor_object, camera.camera);
+        check_sensor(device_, sensor_object);
         std::unique_ptr<BoundDrawing> drawing =
             frame_->draw(camera.camera, shade, sensor, flag_of(stop));
-        if (drawing->is_under_way()) drawing->keep(py::cast(this));
+        if (drawing->is_under_way()) drawing->keep(py::make_tuple(py::cast(this), sensor_object));
         return drawing;
     }
 

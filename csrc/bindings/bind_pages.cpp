@@ -61,24 +61,37 @@ void naming_file(const py::object& path, const Body& body) {
     }
 }
 
-void read_rows(const py::object& path, int descriptor, const PageRun& run, PageCodec codec,
-               const Rows& out) {
-    const GaussianRows<float> rows = out.write();
+// Throws ValueError unless the gaussians are on the host, and are those of the run,
+// whose pages have enough bytes for them.
+void check_rows(const PageRun& run, PageCodec codec, const Rows& gaussians, const char* name) {
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
-    check_is_on_host(out.device(), "out", "expected arrays on the host, got arrays on a device");
-    if (rows.size != count)
-        throw py::value_error("out: expected " + std::to_string(count) + " gaussians, got " +
-                              std::to_string(rows.size));
-    const bool is_quantized = codec == PageCodec::quantized;
+    check_is_on_host(gaussians.device(), name,
+                     "expected arrays on the host, got arrays on a device");
+    if (gaussians.size() != count)
+        refuse_value(name, "expected " + std::to_string(count) + " gaussians, got " +
+                               std::to_string(gaussians.size()));
+    const int sh_degree = gaussians.sh_degree();
+    const size_t gaussian_bytes = sizeof(float) * (11 + 3 * num_sh_bases(sh_degree));
     for (size_t page = 0; page < run.size(); ++page) {
         const Span<const int64_t> clusters = run.clusters(page);
         const auto size = static_cast<size_t>(clusters[clusters.size - 1] - clusters[0]);
-        const size_t needed = is_quantized ? page_bytes(size, clusters.size - 1, rows.sh_degree)
-                                           : sizeof(float) * (11 + rows.num_sh()) * size;
+        const size_t needed = codec == PageCodec::quantized
+                                  ? page_bytes(size, clusters.size - 1, sh_degree)
+                                  : gaussian_bytes * size;
         if (run.num_bytes(page) < needed)
             throw py::value_error("places: expected at least " + std::to_string(needed) +
                                   " bytes for a page, got " + std::to_string(run.num_bytes(page)));
     }
+}
+
+PageCodec page_codec_of(const std::string& name) {
+    return name == "quantized" ? PageCodec::quantized : PageCodec::float32;
+}
+
+void read_rows(const py::object& path, int descriptor, const PageRun& run, PageCodec codec,
+               const Rows& out) {
+    const GaussianRows<float> rows = out.write();
+    check_rows(run, codec, out, "out");
     naming_file(path, [&] {
         const File file = File::duplicate(descriptor);
         read_pages(file, run, codec, rows);
@@ -102,8 +115,21 @@ void read_run(const py::object& path, int descriptor, const py::object& out,
     const PageRun run = bound.read(hashes);
     if (py::isinstance<py::array>(out))
         return read_words(path, descriptor, run, out.cast<py::array>());
-    const PageCodec of = codec == "quantized" ? PageCodec::quantized : PageCodec::float32;
-    read_rows(path, descriptor, run, of, held<Rows>(out, "out"));
+    read_rows(path, descriptor, run, page_codec_of(codec), held<Rows>(out, "out"));
+}
+
+// Writes a range of pages; returns (n, 16) their hashes. `path` is for errors.
+py::object write_run(const py::object& path, int descriptor, const Rows& gaussians,
+                     const std::string& codec, const BoundPageRun& bound) {
+    const auto num_pages = static_cast<py::ssize_t>(bound.places.size() - 1);
+    const NewArray<uint8_t> hashes({}, {num_pages, static_cast<py::ssize_t>(kPageHashBytes)});
+    const PageRun run = bound.read(hashes.object);
+    check_rows(run, page_codec_of(codec), gaussians, "gaussians");
+    const GaussianRows<const float> rows = gaussians.read<float>();
+    naming_file(path, [&] {
+        write_pages(File::duplicate(descriptor), run, page_codec_of(codec), rows, hashes.span.data);
+    });
+    return hashes.object;
 }
 
 std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
@@ -232,6 +258,8 @@ void bind_pages(py::module_& m) {
                                      .places = places};
              }),
              py::kw_only(), "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a);
+    m.def("write_pages", &write_run, "path"_a, "descriptor"_a, "gaussians"_a, "codec"_a, "run"_a,
+          "Encodes and writes a range of pages, and returns (n, 16) their hashes.");
     m.def("read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a,
           "run"_a,
           "Reads and verifies a range of pages; `hashes` is (n, 16). Decodes the gaussians to "

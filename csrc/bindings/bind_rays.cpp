@@ -1,14 +1,14 @@
-// Bindings that cast the rays of a spherical sensor on the host.
+// Bindings that cast the rays of a spherical sensor.
 
-#include "bindings/host_frame.h"
 #include "bindings/operations.h"
-#include "draw/cast_scene.h"
+#include "bindings/rays.h"
 
 namespace v3dg {
 
 namespace {
 
 using Doubles = py::array_t<double, py::array::c_style>;
+using Ints = py::array_t<int32_t, py::array::c_style>;
 
 Span<const double> angles_of(const Doubles& angles, const char* name, double most) {
     const Span<const double> values = span_of<const double>(angles, name, {-1});
@@ -19,159 +19,189 @@ Span<const double> angles_of(const Doubles& angles, const char* name, double mos
     return values;
 }
 
-// A sensor at one pose.
-struct BoundRaySensor {
-    Camera camera;
-    RayGrid grid;
-    RayLimits limits;
+// Returns the places of angles in the picture: a permutation.
+Span<const int32_t> places_of(const Ints& places, const char* name, size_t count) {
+    const Span<const int32_t> values =
+        span_of<const int32_t>(places, name, {static_cast<py::ssize_t>(count)});
+    std::vector<bool> is_taken(count, false);
+    for (const int32_t place : values) {
+        const bool is_new = place >= 0 && static_cast<size_t>(place) < count && !is_taken[place];
+        if (!is_new) refuse_value(name, "expected a permutation of the angles, got others");
+        is_taken[place] = true;
+    }
+    return values;
+}
 
-    RaySensor sensor() const { return {.camera = camera, .grid = grid, .limits = limits}; }
-};
+std::shared_ptr<const RayGrid> grid_of(const Doubles& azimuth, const Doubles& elevation,
+                                       const Ints& rows, const Ints& columns) {
+    const Span<const double> of_columns = angles_of(azimuth, "azimuth", 2 * kPi);
+    const Span<const double> of_rows = angles_of(elevation, "elevation", kPi / 2);
+    return std::make_shared<RayGrid>(of_columns, of_rows, places_of(rows, "rows", of_rows.size),
+                                     places_of(columns, "columns", of_columns.size));
+}
 
 // The planes of a cast; those that are not written are None.
 struct BoundCast {
-    py::object color = py::none(), alpha, range = py::none(), returns = py::none();
-    int64_t gaussians = 0;
-    float tolerance_px2 = 0;
-    double select_ms = 0;
-    RayCounts rays{};
+    py::object color = py::none(), alpha, range, intensity = py::none();
+    py::object second_range = py::none(), second_intensity = py::none();
+    std::vector<int64_t> gaussians;
 };
 
+// The least weight of a return, and the gap behind it.
 using GivenRule = std::optional<std::array<float, 2>>;
 
-// Makes the planes of a cast. With a rule of returns, they are the returns; otherwise
-// colour and range.
-RayPlanes make_planes(const RayGrid& grid, const GivenRule& rule, BoundCast& made) {
-    const py::ssize_t height = grid.num_rows(), width = grid.num_columns();
-    const NewArray<float> alpha(kHost, {height, width});
-    made.alpha = alpha.object;
+// Makes the planes of a cast at `count` poses. With a rule of returns, they are those of
+// the returns; otherwise colour and mean range.
+RayPlanes make_planes(Device device, py::ssize_t count, const RayGrid& grid, const GivenRule& rule,
+                      BoundCast& made) {
+    const std::vector<py::ssize_t> shape{count, grid.num_rows(), grid.num_columns()};
+    const auto plane = [&](py::object& object) {
+        const NewArray<float> array(device, shape);
+        object = array.object;
+        return array.span.data;
+    };
     RayPlanes planes{};
-    planes.alpha = alpha.span.data;
+    planes.alpha = plane(made.alpha);
     if (rule) {
-        static_assert(sizeof(Return) == 3 * sizeof(float));
-        const NewArray<float> returns(kHost, {height, width, kMostReturns, 3});
-        made.returns = returns.object;
-        planes.returns = reinterpret_cast<Return*>(returns.span.data);
+        planes.return_range[0] = plane(made.range);
+        planes.return_intensity[0] = plane(made.intensity);
+        planes.return_range[1] = plane(made.second_range);
+        planes.return_intensity[1] = plane(made.second_intensity);
         planes.rule = {.least_weight = (*rule)[0], .gap = (*rule)[1]};
         return planes;
     }
-    const NewArray<float> color(kHost, {height, width, 3}), range(kHost, {height, width});
+    planes.range = plane(made.range);
+    const NewArray<float> color(device, {count, shape[1], shape[2], 3});
     made.color = color.object;
-    made.range = range.object;
     planes.color = color.span.data;
-    planes.range = range.span.data;
     return planes;
 }
 
-const host::HostModel& host_model(const py::handle& item) {
-    const auto& model = held<BoundModel>(item, "models");
-    check_is_on_host(model.device(), "models", "expected models on the CPU, got one on a device");
-    return static_cast<const host::HostModel&>(*model.handle());
-}
+// Casts the rays of sensors on one device. The models belong to the bundles of the
+// scenes, in order; a scene may have fewer bundles.
+class BoundRayFrame {
+  public:
+    explicit BoundRayFrame(int device) : device_{device} {
+        const Work work(device_);
+        frame_ = work.backend().make_ray_frame(work);
+    }
 
-BoundCast cast_scene(const BoundScene& scene, const py::list& models, const BoundRaySensor& sensor,
-                     const SelectRule& rule, const GivenRule& returns) {
-    check_is_on_host(scene.device(), "scene", "expected a scene on the CPU, got one on a device");
-    if (rule.budget != kNoBudget)
-        throw py::value_error("budget: expected none for rays, got one; leave it out");
-    const std::shared_ptr<const SceneState> state = scene.state();
-    if (models.size() != state->tables.size())
-        throw py::value_error("models: expected one for each bundle of the scene, got " +
-                              std::to_string(models.size()));
-    std::vector<SceneModel> drawn;
-    for (size_t b = 0; b < models.size(); ++b) {
-        const host::HostModel& model = host_model(models[b]);
-        if (model.size() != state->num_gaussians[b])
+    void set_models(const py::list& models) {
+        std::vector<std::shared_ptr<const backend::Model>> handles;
+        std::vector<size_t> num_gaussians;
+        for (const py::handle& item : models) {
+            const auto& model = held<BoundModel>(item, "models");
+            check_device(model.device(), "models");
+            handles.push_back(model.handle());
+            num_gaussians.push_back(model.size());
+        }
+        const Work work(device_);
+        frame_->set_models(std::move(handles), work);
+        num_gaussians_ = std::move(num_gaussians);
+    }
+
+    BoundCast cast_scene(const BoundScene& scene, const RaySensor& sensor,
+                         const py::object& viewmats, const SelectRule& rule,
+                         const GivenRule& returns) const {
+        check_device(scene.device(), "scene");
+        if (rule.budget != kNoBudget)
+            throw py::value_error("budget: expected none for rays, got one; leave it out");
+        const std::shared_ptr<const SceneState> state = scene.state();
+        const std::vector<size_t>& of_scene = state->num_gaussians;
+        if (of_scene.size() > num_gaussians_.size() ||
+            !std::equal(of_scene.begin(), of_scene.end(), num_gaussians_.begin()))
             throw py::value_error(
-                "models: expected the gaussians of the scene's bundles, got "
-                "others");
-        drawn.push_back({.planes = model.planes(),
-                         .appearance = state->bundle(b).appearance(),
-                         .palette = {},
-                         .codes = model.codes()});
+                "scene: expected a scene of the bundles of the models, got other bundles");
+        const auto run = [&](const backend::CastInput& input, const Work& work) {
+            return frame_->cast_scene(scene.handle(), *state, input, work);
+        };
+        return cast(sensor, viewmats, rule, returns, run);
     }
-    BoundCast made;
-    const RayPlanes planes = make_planes(sensor.grid, returns, made);
-    CastCounts counts;
-    {
-        const Unlocked unlocked;
-        counts = cpu::cast_scene({.tables = {state->tables.data(), state->tables.size()},
-                                  .models = {drawn.data(), drawn.size()},
-                                  .instances = state->instances},
-                                 sensor.sensor(), rule, planes);
-    }
-    made.gaussians = counts.gaussians;
-    made.tolerance_px2 = counts.tolerance_px2;
-    made.select_ms = 1e3 * counts.select_seconds;
-    made.rays = counts.rays;
-    return made;
-}
 
-BoundCast cast_model(const BoundModel& bound, const BoundRaySensor& sensor, float filter_px2,
-                     bool antialiased, const GivenRule& returns) {
-    const host::HostModel& model = host_model(py::cast(bound, py::return_value_policy::reference));
-    if (model.planes() == nullptr)
-        throw py::value_error("model: expected the gaussians of an asset, got codes of a bundle");
-    BoundCast made;
-    const RayPlanes planes = make_planes(sensor.grid, returns, made);
-    {
-        const Unlocked unlocked;
-        const Draw<float> draw{.model = model.planes(),
-                               .first = 0,
-                               .count = model.size(),
-                               .view = view_of_world<float>(sensor.camera),
-                               .appearance = {filter_px2, antialiased, false}};
-        made.rays = cpu::cast_rays({draw}, sensor.grid, sensor.limits, planes);
+    BoundCast cast_model(const BoundModel& model, const RaySensor& sensor,
+                         const py::object& viewmats, float filter_px2, bool antialiased,
+                         const GivenRule& returns) const {
+        check_device(model.device(), "model");
+        if (model.has_codes())
+            throw py::value_error(
+                "model: expected the gaussians of an asset, got codes of a bundle");
+        const Appearance<float> appearance{filter_px2, antialiased, false};
+        const auto run = [&](const backend::CastInput& input, const Work& work) {
+            return frame_->cast_model(*model.handle(), appearance, input, work);
+        };
+        return cast(sensor, viewmats, {}, returns, run);
     }
-    made.gaussians = static_cast<int64_t>(model.size());
-    return made;
-}
+
+  private:
+    // Makes the planes, and calls run(input, work) without the GIL.
+    template <class Run>
+    BoundCast cast(const RaySensor& sensor, const py::object& viewmats, const SelectRule& rule,
+                   const GivenRule& returns, const Run& run) const {
+        check_device(device_of(viewmats, "viewmats"), "viewmats");
+        const Reals matrices = reals_of(device_, viewmats, "viewmats", {-1, 4, 4});
+        const py::ssize_t count = shape_of(viewmats, "viewmats")[0];
+        const Work work(device_);
+        BoundCast made;
+        const backend::CastInput input{
+            .sensor = sensor,
+            .viewmats = matrices,
+            .num_poses = static_cast<size_t>(count),
+            .rule = rule,
+            .planes = make_planes(device_, count, *sensor.grid, returns, made)};
+        const Unlocked unlocked;
+        made.gaussians = run(input, work);
+        return made;
+    }
+
+    void check_device(Device device, const char* name) const {
+        if (device != device_) refuse_value(name, "expected the frame's device, got another");
+    }
+
+    Device device_;
+    std::vector<size_t> num_gaussians_;  // number of gaussians of each bundle
+    std::unique_ptr<backend::RayFrame> frame_;
+};
 
 }  // namespace
 
 void bind_rays(py::module_& m) {
-    py::class_<BoundRaySensor>(m, "RaySensor",
-                               "A sensor at one pose: rays of ascending azimuths and elevations. "
-                               "The camera has x forward, y left and z up.")
-        .def(
-            py::init([](const BoundCamera& camera, const Doubles& azimuth, const Doubles& elevation,
-                        float far, float spacing, float min_transmittance) {
-                const Span<const double> columns = angles_of(azimuth, "azimuth", 2 * kPi);
-                const Span<const double> rows = angles_of(elevation, "elevation", kPi / 2);
-                return BoundRaySensor{
-                    .camera = camera.camera,
-                    .grid = RayGrid(columns, rows),
-                    .limits = {.nearest = static_cast<float>(camera.camera.near_depth),
-                               .farthest = far,
-                               .spacing = spacing,
-                               .min_transmittance = min_transmittance}};
-            }),
-            "camera"_a, "azimuth"_a, "elevation"_a, py::kw_only(), "far"_a, "spacing"_a,
-            "min_transmittance"_a);
-    py::class_<BoundCast>(m, "Cast", "The results of casting rays: arrays of H rows and W columns.")
-        .def_readonly("color", &BoundCast::color, "(H, W, 3), premultiplied, or None.")
-        .def_readonly("alpha", &BoundCast::alpha, "(H, W).")
-        .def_readonly("range", &BoundCast::range, "(H, W) mean distance, or None.")
-        .def_readonly("returns", &BoundCast::returns,
-                      "(H, W, 2, 3) range, weight and intensity of each return, or None.")
-        .def_readonly("gaussians", &BoundCast::gaussians)
-        .def_readonly("tolerance_px2", &BoundCast::tolerance_px2)
-        .def_readonly("select_ms", &BoundCast::select_ms)
-        .def_property_readonly("records", [](const BoundCast& c) { return c.rays.records; })
-        .def_property_readonly("entries", [](const BoundCast& c) { return c.rays.entries; })
-        .def_property_readonly("project_ms",
-                               [](const BoundCast& c) { return 1e3 * c.rays.project_seconds; })
-        .def_property_readonly("bin_ms",
-                               [](const BoundCast& c) { return 1e3 * c.rays.bin_seconds; })
-        .def_property_readonly("blend_ms",
-                               [](const BoundCast& c) { return 1e3 * c.rays.blend_seconds; });
-    m.def("cast_scene", &cast_scene, "scene"_a, "models"_a, "sensor"_a, "rule"_a,
-          "returns"_a = py::none(),
-          "Casts the rays of a sensor through the cut of a scene. With `returns`, the least weight "
-          "of a return and the gap behind it, the result has returns, otherwise colour and range.");
-    m.def("cast_model", &cast_model, "model"_a, "sensor"_a, py::kw_only(), "filter_px2"_a,
-          "antialiased"_a, "returns"_a = py::none(),
-          "Casts the rays of a sensor through all gaussians of an asset, like cast_scene().");
+    py::class_<RaySensor>(m, "RaySensor",
+                          "A sensor without a pose: rays of ascending azimuths and elevations. "
+                          "`rows` and `columns` are their places in the picture. The sensor has x "
+                          "forward, y left and z up.")
+        .def(py::init([](const Doubles& azimuth, const Doubles& elevation, const Ints& rows,
+                         const Ints& columns, float near, float far, float spacing,
+                         float min_transmittance) {
+                 return RaySensor{.grid = grid_of(azimuth, elevation, rows, columns),
+                                  .limits = {.nearest = near,
+                                             .farthest = far,
+                                             .spacing = spacing,
+                                             .min_transmittance = min_transmittance}};
+             }),
+             py::kw_only(), "azimuth"_a, "elevation"_a, "rows"_a, "columns"_a, "near"_a, "far"_a,
+             "spacing"_a, "min_transmittance"_a);
+    py::class_<BoundCast>(m, "Cast",
+                          "The results of casting rays at B poses: arrays of H rows and W columns, "
+                          "or None.")
+        .def_readonly("color", &BoundCast::color, "(B, H, W, 3), premultiplied.")
+        .def_readonly("alpha", &BoundCast::alpha, "(B, H, W).")
+        .def_readonly("range", &BoundCast::range,
+                      "(B, H, W) of the first return; without returns, the mean distance.")
+        .def_readonly("intensity", &BoundCast::intensity, "(B, H, W).")
+        .def_readonly("second_range", &BoundCast::second_range, "(B, H, W).")
+        .def_readonly("second_intensity", &BoundCast::second_intensity, "(B, H, W).")
+        .def_readonly("gaussians", &BoundCast::gaussians, "Selected gaussians at each pose.");
+    py::class_<BoundRayFrame>(m, "RayFrame", "Casts the rays of sensors on one device.")
+        .def(py::init<int>(), "device"_a)
+        .def("set_models", &BoundRayFrame::set_models, "models"_a)
+        .def("cast_scene", &BoundRayFrame::cast_scene, "scene"_a, "sensor"_a, "viewmats"_a,
+             "rule"_a, "returns"_a = py::none(),
+             "Casts the rays of a sensor through the cut of a scene at each pose. `viewmats` are "
+             "(B, 4, 4) from the world to the sensor. With `returns`, the least weight of a return "
+             "and the gap behind it, the result has returns, otherwise colour and range.")
+        .def("cast_model", &BoundRayFrame::cast_model, "model"_a, "sensor"_a, "viewmats"_a,
+             py::kw_only(), "filter_px2"_a, "antialiased"_a, "returns"_a = py::none(),
+             "Casts the rays of a sensor through all gaussians of an asset, like cast_scene().");
 }
 
 }  // namespace v3dg

@@ -37,17 +37,16 @@ const T* plane_of(Device device, const py::object& array, const char* name,
 }  // namespace
 
 SensorPlanes NewChannels::allocate(Device device, const Channels& channels,
-                                   const std::vector<py::ssize_t>& shape) {
+                                   const std::vector<py::ssize_t>& shape, SensorPlanes planes) {
     std::vector<py::ssize_t> with_axes = shape;
     with_axes.push_back(3);
     const auto made = [&]<class T>(bool is_wanted, const std::vector<py::ssize_t>& of_plane,
                                    py::object& object, T*& plane) {
-        if (!is_wanted) return;
+        if (!is_wanted || plane != nullptr) return;
         const NewArray<T> array(device, of_plane);
         object = array.object;
         plane = array.span.data;
     };
-    SensorPlanes planes;
     made(channels.median_depth, shape, median_depth, planes.median_depth);
     made(channels.normal, with_axes, normal, planes.normal);
     made(channels.instance, shape, instance, planes.instance);
@@ -71,8 +70,10 @@ BoundMesh::BoundMesh(py::object color, py::object depth, py::object coverage, py
     layer_.normal = plane_of<float>(device_, arrays_[3], "normal", shape_, 3);
     layer_.instance = plane_of<int32_t>(device_, arrays_[4], "instance", shape_, 0);
     layer_.label = plane_of<int32_t>(device_, arrays_[5], "label", shape_, 0);
-    if (layer_.color == nullptr || layer_.coverage == nullptr)
-        throw py::value_error("mesh: expected arrays of colour and coverage, got None");
+    if (layer_.color == nullptr)
+        throw py::value_error("mesh: expected an array of colour, got None");
+    if (layer_.coverage == nullptr && device_ == kHost)
+        throw py::value_error("mesh: expected an array of coverage on the CPU, got None");
     layer_.light = is_linear ? MeshLight::linear : MeshLight::display;
 }
 
@@ -93,15 +94,18 @@ BoundSensor::BoundSensor(const std::vector<std::string>& channels, py::object me
     if (!mesh_.is_none()) held<BoundMesh>(mesh_, "mesh");
 }
 
-SensorRequest BoundSensor::request(Device device, const std::vector<py::ssize_t>& shape) const {
+SensorRequest BoundSensor::request(const std::vector<py::ssize_t>& shape) const {
     SensorRequest request{.channels = channels_, .mesh = {}};
     if (mesh_.is_none()) return request;
     const auto& mesh = held<BoundMesh>(mesh_, "mesh");
-    if (mesh.device() != device)
-        refuse_value("mesh", "expected arrays on the device that draws, got others");
     mesh.check(shape);
     request.mesh = mesh.layer();
     return request;
+}
+
+void BoundSensor::check_device(Device device) const {
+    if (!mesh_.is_none() && held<BoundMesh>(mesh_, "mesh").device() != device)
+        refuse_value("mesh", "expected arrays on the device that draws, got others");
 }
 
 void bind_sensor(py::module_& m) {

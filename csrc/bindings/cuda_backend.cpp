@@ -7,6 +7,7 @@
 #include "base/device_guard.h"
 #include "bindings/backend.h"
 #include "bindings/cuda_frame.h"
+#include "bindings/rays.h"
 #include "levels/fit_level_cuda.h"
 #include "levels/refine_cuts_cuda.h"
 #include "simplify/simplify.h"
@@ -269,6 +270,9 @@ class CudaBackend final : public Backend {
         std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
         const Work& work) const override {
         return cuda::make_asset_frame(std::move(model), appearance, work);
+    }
+    std::unique_ptr<backend::RayFrame> make_ray_frame(const Work&) const override {
+        return cuda::make_ray_frame();
     }
     std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                  bool antialiased) const override {

@@ -4,7 +4,7 @@
 
 #include "bindings/cuda_frame.h"
 
-#include "draw/sensing_frame_cuda.h"
+#include "draw/render_backward_cuda.h"
 
 namespace v3dg::cuda {
 
@@ -60,6 +60,7 @@ class BackendScene final : public backend::Scene {
         tables_.set_instances(state.instances.bundle, state.instances.importance,
                               state.instances.factors, state.environments->table(),
                               stream_of(work));
+        tables_.set_labels(state.label_span(), stream_of(work));
         poses.give_to(tables_, work);
     }
     void set_poses(SceneState& state, const Work& work) override {
@@ -98,9 +99,17 @@ class BackendScene final : public backend::Scene {
     mutable Cut cut_;
 };
 
+}  // namespace
+
 const SceneTables& tables_of(const backend::Scene& scene) {
     return static_cast<const BackendScene&>(scene).tables();
 }
+
+const DeviceModel& model_on_device(const backend::Model& model) {
+    return static_cast<const BackendModel&>(model).on_device();
+}
+
+namespace {
 
 class BackendPool final : public backend::Pool {
   public:
@@ -250,6 +259,18 @@ EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures
                         : EyeImages{{image[0], {}}, 1, stop};
 }
 
+// Allocates the channels of pictures, and returns them with the meshes.
+FrameSensors new_sensors(const SensorRequest& request, NewPictures& pictures, Device device) {
+    if (!request.is_on()) return {};
+    Sensor sensors[2]{};
+    for (size_t k = 0; k < pictures.size(); ++k) {
+        const SensorPlanes planes = pictures[k].channels.allocate(
+            device, request.channels, {pictures[k].height, pictures[k].width});
+        sensors[k] = {.planes = planes, .mesh = request.mesh};
+    }
+    return {.first = sensors[0], .second = sensors[1]};
+}
+
 // Returns a function that allocates the pictures through torch. The frame calls it
 // after the first kernels are enqueued, because allocating is slow.
 cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
@@ -314,10 +335,11 @@ class BackendFrame final : public backend::Frame {
         const EyeImages images = new_images(request.eyes, request.shade, pictures);
         DevicePages* const pages =
             input.pool == nullptr ? nullptr : &static_cast<BackendPool&>(*input.pool).pages();
+        const FrameSensors sensors = new_sensors(request.sensor, pictures, device_);
         SelectRule used = paced;
         std::unique_ptr<Drawing> drawing =
-            frame_.draw(tables_of(input.scene), pages, request, used, images, stream_of(work),
-                        place_of(pictures, device_));
+            frame_.draw(tables_of(input.scene), pages, request, used, images, sensors,
+                        stream_of(work), place_of(pictures, device_));
         // Report the tolerance of the request. With a pool, report the tolerance that
         // the pool may have raised.
         const SelectRule& reported = pages == nullptr ? request.rule : used;
@@ -349,49 +371,24 @@ class BackendAssetFrame final : public backend::AssetFrame {
                                        const std::atomic<bool>*) override {
         const Turn turn(*turns_);
         const Work work(device_);
-        if (sensor.is_on()) return draw_sensed(camera, shade, sensor, work);
         NewPictures pictures;
         const EyeImages images = new_images(camera, shade, pictures);
+        const FrameSensors sensors = new_sensors(sensor, pictures, device_);
         const PackedModel& packed = *static_cast<const BackendModel&>(*model_).on_device().packed;
         std::unique_ptr<Drawing> drawing =
             frame_.draw(packed.rows(), view_of_world<float>(camera), appearance_.filter_px2,
                         appearance_.antialiased, images.image[0], stream_of(work), &packed.packed(),
-                        images.min_transmittance, place_of(pictures, device_));
+                        images.min_transmittance, place_of(pictures, device_), sensors);
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), SelectRule{}, nullptr);
     }
 
   private:
-    // Draws with channels and meshes. Waits.
-    std::unique_ptr<BoundDrawing> draw_sensed(const Camera& camera, const Shade& shade,
-                                              const SensorRequest& sensor, const Work& work)
-        V3DG_REQUIRES(*turns_) {
-        NewPictures pictures;
-        const EyeImages images = new_images(camera, shade, pictures);
-        ModelPicture picture{
-            .rows = static_cast<const BackendModel&>(*model_).on_device().packed->rows(),
-            .view = view_of_world<float>(camera),
-            .filter_px2 = appearance_.filter_px2,
-            .antialiased = appearance_.antialiased,
-            .image = images.image[0]};
-        picture.image.planes = planes_of(pictures[0], device_);
-        const SensorPlanes channels = pictures[0].channels.allocate(
-            device_, sensor.channels, {pictures[0].height, pictures[0].width});
-        if (sensing_ == nullptr) sensing_ = std::make_unique<SensingFrame>();
-        std::unique_ptr<Drawing> drawing =
-            sensing_->draw(picture, images.min_transmittance,
-                           {.planes = channels, .mesh = sensor.mesh}, stream_of(work));
-        return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
-                                                 std::move(drawing), SelectRule{}, nullptr);
-    }
-
     const Device device_;
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
     const std::shared_ptr<const backend::Model> model_;
     const Appearance<float> appearance_;
     ModelFrame frame_ V3DG_GUARDED_BY(*turns_);
-    // The frame of pictures with channels; made when it is needed.
-    std::unique_ptr<SensingFrame> sensing_ V3DG_GUARDED_BY(*turns_);
 };
 
 class DeviceTape final : public Tape {

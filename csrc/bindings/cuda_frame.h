@@ -39,6 +39,12 @@ std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const back
                                                       Appearance<float> appearance,
                                                       const Work& work);
 
+std::unique_ptr<backend::RayFrame> make_ray_frame();
+
+// Return the memory of handles.
+const SceneTables& tables_of(const backend::Scene& scene);
+const DeviceModel& model_on_device(const backend::Model& model);
+
 // Implements Backend::rasterize().
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);

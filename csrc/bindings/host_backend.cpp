@@ -4,6 +4,7 @@
 
 #include "bindings/backend.h"
 #include "bindings/host_frame.h"
+#include "bindings/rays.h"
 #include "quantize/quantize.h"
 #include "residency/host_pages.h"
 #include "simplify/simplify.h"
@@ -176,6 +177,9 @@ class HostBackend final : public Backend {
         std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
         const Work&) const override {
         return host::make_asset_frame(std::move(model), appearance);
+    }
+    std::unique_ptr<backend::RayFrame> make_ray_frame(const Work&) const override {
+        return host::make_ray_frame();
     }
     std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                  bool antialiased) const override {

@@ -47,6 +47,8 @@ std::unique_ptr<backend::Frame> make_frame();
 std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
                                                       Appearance<float> appearance);
 
+std::unique_ptr<backend::RayFrame> make_ray_frame();
+
 // Implements Backend::rasterize() for float32 and float64.
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);

@@ -76,26 +76,92 @@ class HostViewsTape final : public ViewsTape {
                 reinterpret_cast<CenterSize<T>*>(zeros<T>({num_views, n, 2}, made.center_sizes));
         T* const poses = wanted.poses ? zeros<T>({num_views, 3, 4}, made.poses) : nullptr;
         const Unlocked unlocked;
-        for (size_t view = 0; view < cameras_.size(); ++view) {
-            const size_t skipped = view * sums.size;
-            GaussianRows<T> out = sums;
-            if (wanted.opacities_for_each_view) out.opacities += skipped;
-            if (wanted.sh_for_each_view) out.sh += skipped * out.num_sh();
-            CenterGradients<T> of_view = centers;
-            if (of_view.sum != nullptr) of_view.sum += 2 * skipped;
-            if (of_view.size != nullptr) of_view.size += skipped;
-            PoseSums<double> pose{};
-            const ViewSums view_sums{.pose = poses != nullptr ? &pose : nullptr};
-            const Draw<T> draw = draw_of(view);
-            render_backward<T>(draw, cameras_[view].template intrinsics<T>(), picture_of(view),
-                               planes.of_view(view), workspaces_[view], out, of_view,
-                               background + 3 * view, &view_sums);
-            if (poses != nullptr) set_pose(pose, draw.view, poses + 12 * view);
-        }
+        add_views({.rows = sums, .centers = centers, .background = background, .poses = poses},
+                  wanted, planes);
         return made;
     }
 
   private:
+    // The gradients of all views.
+    struct Sums {
+        GaussianRows<T> rows;
+        CenterGradients<T> centers;
+        T *background, *poses;
+    };
+
+    // Rows of gradients that are summed over the views, for one view.
+    class Scratch {
+      public:
+        GaussianRows<T> cleared(const GaussianRows<T>& sums, const ViewsWanted& wanted) {
+            const size_t n = sums.size;
+            const size_t num_sh = wanted.sh_for_each_view ? 0 : sums.num_sh() * n;
+            const size_t num_opacities = wanted.opacities_for_each_view ? 0 : n;
+            values_.assign(10 * n + num_opacities + num_sh, T(0));
+            GaussianRows<T> rows = sums;
+            rows.means = values_.data();
+            rows.quats = rows.means + 3 * n;
+            rows.scales = rows.quats + 4 * n;
+            if (num_opacities > 0) rows.opacities = rows.scales + 3 * n;
+            if (num_sh > 0) rows.sh = rows.scales + 3 * n + num_opacities;
+            return rows;
+        }
+        void add_to(const GaussianRows<T>& sums, const ViewsWanted& wanted) const {
+            const size_t n = sums.size;
+            const T* from = values_.data();
+            const auto add = [&](size_t width, T* to) {
+                for (size_t i = 0; i < width * n; ++i) to[i] += from[i];
+                from += width * n;
+            };
+            add(3, sums.means);
+            add(4, sums.quats);
+            add(3, sums.scales);
+            if (!wanted.opacities_for_each_view) add(1, sums.opacities);
+            if (!wanted.sh_for_each_view) add(sums.num_sh(), sums.sh);
+        }
+
+      private:
+        std::vector<T> values_;
+    };
+
+    // Adds the gradients of all views in their order. If gaussians are few, each thread
+    // computes a view, whose rows are then added. All threads together compute the views
+    // that are left over.
+    void add_views(const Sums& sums, const ViewsWanted& wanted,
+                   const ViewsGradientPlanes<T>& planes) {
+        constexpr size_t kMostScratchRows = size_t(1) << 21;
+        const size_t num_views = cameras_.size();
+        const size_t num_threads = most_threads();
+        const bool spreads = num_threads > 1 && sums.rows.size * num_threads <= kMostScratchRows;
+        const size_t first_left_over = spreads ? num_views - num_views % num_threads : 0;
+        std::vector<Scratch> scratch(spreads ? num_threads : 0);
+        for (size_t first = 0; first < first_left_over; first += num_threads) {
+            parallel_for(num_threads, 1, [&](size_t k) {
+                add_view(first + k, scratch[k].cleared(sums.rows, wanted), sums, wanted, planes);
+            });
+            for (const Scratch& of_view : scratch) of_view.add_to(sums.rows, wanted);
+        }
+        for (size_t view = first_left_over; view < num_views; ++view)
+            add_view(view, sums.rows, sums, wanted, planes);
+    }
+
+    // Adds the gradients of a view to `rows`, and sets those that it alone has.
+    void add_view(size_t view, GaussianRows<T> rows, const Sums& sums, const ViewsWanted& wanted,
+                  const ViewsGradientPlanes<T>& planes) const {
+        const size_t skipped = view * rows.size;
+        if (wanted.opacities_for_each_view) rows.opacities += skipped;
+        if (wanted.sh_for_each_view) rows.sh += skipped * rows.num_sh();
+        CenterGradients<T> centers = sums.centers;
+        if (centers.sum != nullptr) centers.sum += 2 * skipped;
+        if (centers.size != nullptr) centers.size += skipped;
+        PoseSums<double> pose{};
+        const ViewSums view_sums{.pose = sums.poses != nullptr ? &pose : nullptr};
+        const Draw<T> draw = draw_of(view);
+        render_backward<T>(draw, cameras_[view].template intrinsics<T>(), picture_of(view),
+                           planes.of_view(view), workspaces_[view], rows, centers,
+                           sums.background + 3 * view, &view_sums);
+        if (sums.poses != nullptr) set_pose(pose, draw.view, sums.poses + 12 * view);
+    }
+
     py::ssize_t height() const { return static_cast<py::ssize_t>(cameras_[0].height); }
     py::ssize_t width() const { return static_cast<py::ssize_t>(cameras_[0].width); }
     size_t num_pixels() const { return static_cast<size_t>(height() * width()); }

@@ -16,16 +16,18 @@ struct NewChannels {
     py::object median_depth = py::none(), normal = py::none(), instance = py::none(),
                label = py::none(), weight = py::none(), clipped = py::none();
 
-    // Allocates the arrays. `shape` is that of a plane: (H, W) or (B, H, W).
+    // Allocates the arrays of channels that have none in `planes`, and returns the
+    // planes of all channels. `shape` is that of a plane: (H, W) or (B, H, W).
     SensorPlanes allocate(Device device, const Channels& channels,
-                          const std::vector<py::ssize_t>& shape);
+                          const std::vector<py::ssize_t>& shape, SensorPlanes planes = {});
 };
 
 // A layer of meshes: borrowed arrays of one picture (H, W) or of many (B, H, W).
 class BoundMesh {
   public:
     // color: (..., 3). depth, coverage: (...). normal: (..., 3) or None. instance,
-    // label: (...) int32 or None.
+    // label: (...) int32 or None. On a CUDA device, coverage may be None: 1 where the
+    // depth is positive and finite.
     BoundMesh(py::object color, py::object depth, py::object coverage, py::object normal,
               py::object instance, py::object label, bool is_linear);
 
@@ -48,9 +50,11 @@ class BoundSensor {
     BoundSensor(const std::vector<std::string>& channels, py::object mesh);
 
     const Channels& channels() const { return channels_; }
-    // Returns the request for planes of this shape on this device. Throws ValueError if
-    // the mesh has another shape or is on another device.
-    SensorRequest request(Device device, const std::vector<py::ssize_t>& shape) const;
+    // Returns the request for planes of this shape. Throws ValueError if the mesh has
+    // another shape.
+    SensorRequest request(const std::vector<py::ssize_t>& shape) const;
+    // Throws ValueError if there is a mesh on another device.
+    void check_device(Device device) const;
 
   private:
     Channels channels_;

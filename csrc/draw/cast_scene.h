@@ -1,17 +1,20 @@
 #pragma once
 
-// Casts the rays of a spherical sensor through a scene on the host.
+// Casts the rays of a spherical sensor through a scene: the sensor, and the function of
+// the host. cast_scene_cuda.h has that of CUDA devices.
+
+#include <memory>
 
 #include "draw/scene_frame.h"
 #include "rays/rays.h"
 
 namespace v3dg {
 
-// The sensor: its pose, with x forward, y left and z up in view space, as a camera
-// whose px2_per_steradian() is one over the squared spacing of rays; and its rays.
+// A sensor without a pose. Its pose has x forward, y left and z up in view space. The
+// camera that selects its cuts has one over the squared spacing of rays as
+// px2_per_steradian().
 struct RaySensor {
-    const Camera& camera;
-    const RayGrid& grid;
+    std::shared_ptr<const RayGrid> grid;
     RayLimits limits;
 };
 
@@ -24,10 +27,10 @@ struct CastCounts {
 
 namespace cpu {
 
-// Selects the cut of a sensor, without a frustum, and casts all rays through it. `rule`
-// has no budget.
-CastCounts cast_scene(const HostScene& scene, const RaySensor& sensor, SelectRule rule,
-                      const RayPlanes& planes);
+// Selects the cut of a sensor, without a frustum, and casts all rays through it. The
+// camera has the pose of the sensor, and its density. `rule` has no budget.
+CastCounts cast_scene(const HostScene& scene, const RaySensor& sensor, const Camera& camera,
+                      SelectRule rule, const RayPlanes& planes);
 
 }  // namespace cpu
 }  // namespace v3dg

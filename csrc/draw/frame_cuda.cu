@@ -9,6 +9,7 @@
 #include <string>
 
 #include "project/project_backward.h"
+#include "rasterize/sense_math.h"
 
 namespace v3dg {
 namespace cuda {
@@ -153,6 +154,7 @@ void Frame::enlarge(const FrameCounters& counters) {
 void Frame::release_large_buffers() {
     wait_before_unmapping();
     records_.release();
+    normals_ = {};
     boxes_ = {};
     large_.release();
     entries_.release();
@@ -165,6 +167,10 @@ void Frame::release_buffers() {
     items_ = {};
     item_records_ = {};
     item_tiles_ = {};
+    normals_ = {};
+    instances_ = {};
+    source_ = {};
+    order_ = {};
     release_large_buffers();
     trim_pool(last_stream_);
 }
@@ -231,8 +237,10 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     // lists of small records are no longer needed.
     FewTiles* few = room(scratch_, capacity.spread, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
-    uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
-    if (keeps_tape) room(boxes_, capacity.records, drawing);
+    const FrameSensors& sensors = batch.sensors;
+    const bool needs_source = keeps_tape || sensors.needs_normals() || sensors.needs_instances();
+    uint32_t* source = needs_source ? room(source_, capacity.records, drawing) : nullptr;
+    if (needs_source) room(boxes_, capacity.records, drawing);
     const RecordPlanes planes = records();
     const TileBinOutput bins{.tile_first = room(tile_first_, batch.num_tiles + 1, drawing),
                              .image_of_tile = room(image_of_tile_, batch.num_tiles, drawing),
@@ -277,10 +285,11 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
               .counts = tiles,
               .counters = &state->counters},
              bins, stream);
-    num_plans_ = keeps_tape ? batch.num_tiles : most_plans(batch.num_tiles);
+    const bool needs_order = keeps_tape || sensors.is_on();
+    num_plans_ = needs_order ? batch.num_tiles : most_plans(batch.num_tiles);
     room(plans_, num_plans_, drawing);
-    const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
-                          keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
+    const RasterTape tape{needs_order ? room(order_, capacity.entries, drawing) : nullptr,
+                          needs_order ? room(blended_, batch.num_tiles, drawing) : nullptr};
     FrameLists of_frame = lists(batch);
     // With a tape, the counts are copied before blending, so that the caller need not
     // wait for the pictures. Without a tape, the blend kernel writes them to host
@@ -302,7 +311,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
         of_frame.planes[k] = drawing.planes_[k];
         of_frame.has_depth = of_frame.has_depth || drawing.planes_[k].depth != nullptr;
     }
-    rasterize(of_frame, keeps_tape ? &tape : nullptr, stream);
+    rasterize(of_frame, needs_order ? &tape : nullptr, stream);
+    if (sensors.is_on()) sense(drawing, of_frame, tape, items, source);
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
@@ -312,6 +322,41 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (was_captured_ || keeps_tape) return;
     check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
     num_zero_bytes_ = num_zero_bytes;
+}
+
+void Frame::sense(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+                  const ItemList& items, const uint32_t* source) {
+    const SceneTables* scene = drawing.batch_.sensed_scene.scene;
+    if (scene == nullptr) {
+        sense_scene(drawing, lists, tape, items, source, SceneOnDevice{});
+        return;
+    }
+    const StreamLock lock = scene->lock(drawing.stream_);
+    sense_scene(drawing, lists, tape, items, source, scene->on_device());
+}
+
+void Frame::sense_scene(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+                        const ItemList& items, const uint32_t* source, const SceneOnDevice& scene) {
+    const FrameBatch& batch = drawing.batch_;
+    const FrameSensors& sensors = batch.sensors;
+    const size_t num_records = drawing.capacity_.records;
+    float* normals = sensors.needs_normals() ? room(normals_, 3 * num_records, drawing) : nullptr;
+    int32_t* instances =
+        sensors.needs_instances() ? room(instances_, num_records, drawing) : nullptr;
+    if (source != nullptr)
+        find_sensed_records({.items = items,
+                             .item_records = item_records_.data(),
+                             .source = source,
+                             .placements = batch.placements,
+                             .models = batch.models,
+                             .packed = batch.packed,
+                             .coded = batch.coded,
+                             .scene = batch.sensed_scene,
+                             .environments = scene.environments},
+                            normals, instances, drawing.stream_);
+    const int32_t* labels = scene.label.empty() ? nullptr : scene.label.data;
+    cuda::sense(lists, tape, {.normal = normals, .instance = instances, .label = labels}, sensors,
+                drawing.stream_);
 }
 
 FrameLists Frame::lists(const FrameBatch& batch) const {
@@ -342,7 +387,8 @@ std::vector<std::pair<const char*, size_t>> Frame::bytes() const {
         {"items", items_.bytes() + item_records_.bytes() + item_tiles_.bytes()},
         {"large", large_.bytes()},
         {"tiles", tile_first_.bytes() + image_of_tile_.bytes() + plans_.bytes() + cleared_.bytes()},
-        {"tape", tape}};
+        {"tape", tape},
+        {"channels", normals_.bytes() + instances_.bytes()}};
 }
 
 RecordPlanes Frame::records() const {

@@ -10,6 +10,7 @@
 
 #include "base/device.h"
 #include "base/mapped_memory.h"
+#include "draw/sensed_records.h"
 #include "frame/tile_list.h"
 #include "project/project_cuda.h"
 #include "rasterize/rasterize.h"
@@ -49,6 +50,9 @@ struct FrameBatch {
     // Whether images become NaN if they are not drawn because a buffer is too small.
     // All of them have planes.
     bool marks_undrawn = false;
+    // Channels and meshes of the images; and the scene that the channels show.
+    FrameSensors sensors = {};
+    SensedScene sensed_scene = {};
 };
 
 // The results of a frame that its backward pass needs. Valid until the next frame is
@@ -117,6 +121,12 @@ class Frame {
     struct Slot;
     struct State;
     void enqueue(Drawing& drawing, const Place& place);
+    // Enqueues the sensor pass. `source` is as in ProjectOutput; it may be null if no
+    // channel needs it.
+    void sense(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+               const ItemList& items, const uint32_t* source);
+    void sense_scene(const Drawing& drawing, const FrameLists& lists, const RasterTape& tape,
+                     const ItemList& items, const uint32_t* source, const SceneOnDevice& scene);
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
@@ -143,6 +153,9 @@ class Frame {
     Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
+    // Normals and instances of records, for channels.
+    DeviceBuffer<float> normals_;
+    DeviceBuffer<int32_t> instances_;
     DeviceBuffer<ItemTiles> item_tiles_;
     // The large buffers.
     GrowingBuffer<float> records_;

@@ -53,7 +53,7 @@ struct FrameRequest {
     // the host only.
     bool is_plain() const {
         return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty() &&
-               !sensor.is_on();
+               !sensor.channels.clipped;
     }
 };
 
@@ -64,7 +64,7 @@ struct BatchRequest {
     Shade shade;  // ignores `with_depth`: depth is drawn if there are planes for it
     int width, height;
     BatchPlanes planes;
-    // Channels and meshes of the pictures, one after another. Only on the host.
+    // Channels and meshes of the pictures, one after another.
     Sensor sensor = {};
 };
 

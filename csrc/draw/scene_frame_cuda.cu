@@ -110,7 +110,8 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
 }
 
 FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures,
-                             const SelectRule& rule, cudaStream_t stream) {
+                             const SelectRule& rule, const FrameSensors& sensors,
+                             cudaStream_t stream) {
     const FrameImage& last = pictures.image[pictures.count - 1];
     const Span<const InstanceFactors> factors = scene.on_device().instances.factors;
     return {.models = rows_.data(),
@@ -130,7 +131,11 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             .num_factors = static_cast<uint32_t>(factors.size),
             .guards_models = nullptr,
             .num_zeros = Cut::num_zeros(scene, rule),
-            .has_depth = false};
+            .has_depth = false,
+            .sensors = sensors,
+            .sensed_scene = {
+                .scene = &scene,
+                .num_slots = static_cast<uint32_t>(std::max<size_t>(scene.num_instances(), 1))}};
 }
 
 // Returns the rule for drawing a frame again after a buffer was too small.
@@ -141,20 +146,22 @@ static SelectRule drawn_again(SelectRule rule) {
 
 std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, DevicePages* pages,
                                           const FrameRequest& request, SelectRule& rule,
-                                          const EyeImages& pictures, cudaStream_t stream,
-                                          const Frame::Place& place) {
+                                          const EyeImages& pictures, const FrameSensors& sensors,
+                                          cudaStream_t stream, const Frame::Place& place) {
     const Eyes& eyes = request.eyes;
-    if (request.cut) return draw_given(scene, request, pictures, stream, place);
-    if (pages != nullptr) return draw_resident(scene, *pages, eyes, rule, pictures, stream, place);
-    return draw_selected(scene, eyes, rule, pictures, stream, place);
+    if (request.cut) return draw_given(scene, request, pictures, sensors, stream, place);
+    if (pages != nullptr)
+        return draw_resident(scene, *pages, eyes, rule, pictures, sensors, stream, place);
+    return draw_selected(scene, eyes, rule, pictures, sensors, stream, place);
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw_selected(const SceneTables& scene, const Eyes& eyes,
                                                    const SelectRule& rule,
-                                                   const EyeImages& pictures, cudaStream_t stream,
+                                                   const EyeImages& pictures,
+                                                   const FrameSensors& sensors, cudaStream_t stream,
                                                    const Frame::Place& place) {
     return frame_.draw(
-        batch(scene, pictures, rule, stream),
+        batch(scene, pictures, rule, sensors, stream),
         [=, this, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on);
@@ -165,13 +172,15 @@ std::unique_ptr<Drawing> SceneFrame::draw_selected(const SceneTables& scene, con
 
 std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, DevicePages& pages,
                                                    const Eyes& eyes, SelectRule& rule,
-                                                   const EyeImages& pictures, cudaStream_t stream,
+                                                   const EyeImages& pictures,
+                                                   const FrameSensors& sensors, cudaStream_t stream,
                                                    const Frame::Place& place) {
     const StreamLock lock(pages.mutex(), stream);
     const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
     PartlyResident resident = pages.begin_frame(true, arrive, stream);
     SelectRule next = rule = pages.raised(rule);
-    FrameBatch of_pages = batch(scene, pictures, rule, stream);
+    FrameBatch of_pages = batch(scene, pictures, rule, sensors, stream);
+    of_pages.models = nullptr;  // slots of a pool have no rows
     of_pages.packed = pages.packed();
     of_pages.coded = pages.coded();
     of_pages.guards_models = &pages.mutex();
@@ -191,11 +200,13 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
 
 std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene,
                                                 const FrameRequest& request,
-                                                const EyeImages& pictures, cudaStream_t stream,
+                                                const EyeImages& pictures,
+                                                const FrameSensors& sensors, cudaStream_t stream,
                                                 const Frame::Place& place) {
     const GivenCut given = *request.cut;
     const float tolerance_px2 = request.rule.tolerance_px2;
-    FrameBatch of_cut = batch(scene, pictures, SelectRule{.tolerance_px2 = tolerance_px2}, stream);
+    FrameBatch of_cut =
+        batch(scene, pictures, SelectRule{.tolerance_px2 = tolerance_px2}, sensors, stream);
     of_cut.has_faded_items = given.weight.size > 0;
     return frame_.draw(
         of_cut,
@@ -238,7 +249,8 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
                                           const ModelView<float>& view, float filter_px2,
                                           bool antialiased, const FrameImage& image,
                                           cudaStream_t stream, const PackedPlanes* packed,
-                                          float min_transmittance, const Frame::Place& place) {
+                                          float min_transmittance, const Frame::Place& place,
+                                          const FrameSensors& sensors) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
     const ModelTables tables{
@@ -251,7 +263,8 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
                            .packed = packed == nullptr ? nullptr : &on_device->packed,
                            .min_transmittance = min_transmittance,
                            .has_lenses = !image.camera.is_pinhole(),
-                           .has_depth = image.planes.depth != nullptr};
+                           .has_depth = image.planes.depth != nullptr,
+                           .sensors = sensors};
     const unsigned blocks =
         std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
     return frame_.draw(

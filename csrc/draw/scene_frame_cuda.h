@@ -94,17 +94,18 @@ class SceneFrame {
                     cudaStream_t stream);
 
     // Enqueues a plain request (FrameRequest::is_plain). `pictures` are the pictures to
-    // draw; `place` sets their destinations. With `pages`, it first brings in pages
-    // that are ready, then draws the resident part of the pool's bundles. `rule` is the
-    // request's rule after the pacing of a budget; it is set to the rule that was used.
+    // draw, with the channels and meshes of `sensors`; `place` sets their destinations.
+    // With `pages`, it first brings in pages that are ready, then draws the resident
+    // part of the pool's bundles. `rule` is the request's rule after the pacing of a
+    // budget; it is set to the rule that was used.
     //
     // The scene, the pool and a given cut must exist until the drawing is finished. A
     // given cut is on the device and has one picture. If the frame is drawn again, it
     // uses the pages that are resident at that time.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, DevicePages* pages,
                                   const FrameRequest& request, SelectRule& rule,
-                                  const EyeImages& pictures, cudaStream_t stream,
-                                  const Frame::Place& place);
+                                  const EyeImages& pictures, const FrameSensors& sensors,
+                                  cudaStream_t stream, const Frame::Place& place);
 
     // Draws a picture for each camera of a batch, in parts if the batch is large. Like
     // draw(), but it writes the planes of the request. The first kernels read the
@@ -128,17 +129,18 @@ class SceneFrame {
 
     std::unique_ptr<Drawing> draw_selected(const SceneTables& scene, const Eyes& eyes,
                                            const SelectRule& rule, const EyeImages& pictures,
-                                           cudaStream_t stream, const Frame::Place& place);
+                                           const FrameSensors& sensors, cudaStream_t stream,
+                                           const Frame::Place& place);
     std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages,
                                            const Eyes& eyes, SelectRule& rule,
-                                           const EyeImages& pictures, cudaStream_t stream,
-                                           const Frame::Place& place);
+                                           const EyeImages& pictures, const FrameSensors& sensors,
+                                           cudaStream_t stream, const Frame::Place& place);
     std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const FrameRequest& request,
-                                        const EyeImages& pictures, cudaStream_t stream,
-                                        const Frame::Place& place);
+                                        const EyeImages& pictures, const FrameSensors& sensors,
+                                        cudaStream_t stream, const Frame::Place& place);
     // Returns the batch that draws the models.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
-                     cudaStream_t stream);
+                     const FrameSensors& sensors, cudaStream_t stream);
 
     std::vector<DeviceModel> models_;
     std::vector<std::shared_ptr<const DevicePalette>> palettes_;
@@ -217,7 +219,7 @@ class ModelFrame {
                                   const FrameImage& image, cudaStream_t stream,
                                   const PackedPlanes* packed = nullptr,
                                   float min_transmittance = kStopsBefore,
-                                  const Frame::Place& place = {});
+                                  const Frame::Place& place = {}, const FrameSensors& sensors = {});
     FrameTape tape() const { return frame_.tape(); }
 
   private:

@@ -22,6 +22,9 @@ struct CutComparison {
     // kMostWindows.
     int windows_per_step;
     int cuts_per_view;  // cuts that are compared with each picture of the target
+    // Weight of the |mean difference| of a window, relative to LossWeights::l1 and
+    // LossWeights::alpha.
+    float window_means;
 };
 constexpr int kMostWindows = 32;
 
@@ -37,9 +40,10 @@ constexpr int kMostWindows = 32;
 // All levels are drawn with the filter of `config`. This includes level 0, although it
 // is drawn without a filter elsewhere; in small pictures, aliasing is a third of the
 // error of cuts. Pictures of the target are drawn larger and averaged. The loss is the
-// loss of a fit without D-SSIM. Steps of positions are relative to the radius. The step
-// sizes in `config` are for a gaussian that one window shows. The image sizes,
-// supersampling and numbers of views in `config` are ignored.
+// loss of a fit without D-SSIM, and of the mean differences of windows. Steps of
+// positions are relative to the radius. The step sizes in `config` are for a gaussian
+// that one window shows. The image sizes, supersampling and numbers of views in
+// `config` are ignored.
 //
 // The result does not depend on the number of threads. If `progress.cancel` becomes
 // true, it returns early. `progress.groups_done` counts windows.

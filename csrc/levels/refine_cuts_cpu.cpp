@@ -4,7 +4,6 @@
 #include "levels/refine_cuts.h"
 
 #include <algorithm>
-#include <numeric>
 #include <optional>
 #include <vector>
 
@@ -46,11 +45,12 @@ class Canvas {
     std::vector<float> values_;
 };
 
-// The differences of a cell's pixels, and their sum. A cell at the border of a picture
-// may have less than kCellSide columns or rows.
+// A cell, the sum of its pixels' differences, and sums for the window. A cell at the
+// border of a picture may have less than kCellSide columns or rows.
 struct Cell {
     size_t x0, y0, x1, y1;
     PixelValues sum;
+    WindowSums of_window;
 
     Cell(const ReadPlanes& drawn, const ReadPlanes& wanted, size_t width, size_t height, size_t x,
          size_t y)
@@ -58,12 +58,14 @@ struct Cell {
           y0(y),
           x1(std::min(x + kCellSide, width)),
           y1(std::min(y + kCellSide, height)),
-          sum{} {
+          sum{},
+          of_window{} {
         for (size_t row = y0; row < y1; ++row)
             for (size_t column = x0; column < x1; ++column) {
                 const size_t i = row * width + column;
                 const PixelValues pixel = difference(drawn.at(i), wanted.at(i));
                 for (int k = 0; k < 4; ++k) sum.value[k] += pixel.value[k];
+                of_window.add_pixel(drawn.at(i), wanted.at(i));
             }
     }
     static PixelValues difference(PixelValues pixel, const PixelValues& of_target) {
@@ -73,32 +75,38 @@ struct Cell {
 };
 
 // Replaces the picture by the gradients of the loss.
-void put_slopes(const LossWeights& loss, const Canvas& target, Canvas& picture) {
+void put_slopes(const LossWeights& loss, float window_means, const Canvas& target,
+                Canvas& picture) {
     const auto width = static_cast<size_t>(picture.width()),
                height = static_cast<size_t>(picture.height());
     const ReadPlanes drawn = picture.planes(), wanted = target.planes();
-    std::vector<double> loss_of_row(num_cells(height), 0.0);
+    std::vector<WindowSums> sums_of_row(num_cells(height), WindowSums{});
     const auto put_cell = [&](const Cell& cell) {
-        double cell_loss = 0;
+        WindowSums sums = cell.of_window;
         for (size_t y = cell.y0; y < cell.y1; ++y)
             for (size_t i = y * width + cell.x0; i < y * width + cell.x1; ++i) {
                 PixelValues pixel = Cell::difference(drawn.at(i), wanted.at(i));
-                cell_loss += put_slopes(loss, cell.sum, pixel);
+                sums.loss() += put_slopes(loss, cell.sum, pixel);
                 for (size_t k = 0; k < 3; ++k) picture.color()[3 * i + k] = pixel.value[k];
                 picture.alpha()[i] = pixel.value[3];
             }
-        return cell_loss;
+        return sums;
     };
-    parallel_for(loss_of_row.size(), 2, [&](size_t row) {
+    parallel_for(sums_of_row.size(), 2, [&](size_t row) {
         for (size_t x = 0; x < width; x += kCellSide)
-            loss_of_row[row] += put_cell(Cell(drawn, wanted, width, height, x, row * kCellSide));
+            sums_of_row[row].add(put_cell(Cell(drawn, wanted, width, height, x, row * kCellSide)));
     });
-    const double loss_sum = std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0);
-    const float weight = weight_of_picture(loss_sum, static_cast<double>(width * height));
+    WindowSums sums{};
+    for (const WindowSums& of_row : sums_of_row) sums.add(of_row);
+    const WindowSlopes slopes =
+        slopes_of_window(loss, window_means, sums, static_cast<double>(width * height));
     parallel_for(height, 8, [&](size_t y) {
         for (size_t i = y * width; i < (y + 1) * width; ++i) {
-            for (size_t k = 0; k < 3; ++k) picture.color()[3 * i + k] *= weight;
-            picture.alpha()[i] *= weight;
+            for (int k = 0; k < 3; ++k) {
+                float& slope = picture.color()[3 * i + static_cast<size_t>(k)];
+                slope = slopes.weighed(slope, k);
+            }
+            picture.alpha()[i] = slopes.weighed(picture.alpha()[i], 3);
         }
     });
 }
@@ -331,7 +339,7 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison, const
             const GaussianRows<float>& shown = frame.start(index.size(), rows.sh_degree);
             parallel_for(index.size(), kGaussiansAtOnce,
                          [&](size_t g) { copy_gaussian(rows, index[g], shown, g); });
-            put_slopes(config.loss, wanted, frame.draw(window.camera));
+            put_slopes(config.loss, comparison.window_means, wanted, frame.draw(window.camera));
             sum.add(index, frame.backward());
             ++progress.groups_done;
         }

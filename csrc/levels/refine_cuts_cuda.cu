@@ -351,31 +351,34 @@ class StepsAhead {
 // Computes the gradients of the loss with respect to the pixels of a step's windows.
 class Comparison {
   public:
-    Comparison(const LossWeights& loss, unsigned num_windows, const Canvases& canvases,
+    Comparison(const LossWeights& loss, const CutComparison& settings, const Canvases& canvases,
                cudaStream_t stream)
         : loss_(loss),
+          window_means_(settings.window_means),
           canvases_(canvases),
           stream_(stream),
-          losses_(blocks_for(kMostPixels, kThreads) * num_windows, stream),
-          weights_(num_windows, stream) {}
+          sums_(blocks_for(kMostPixels, kThreads) * static_cast<size_t>(settings.windows_per_step),
+                stream),
+          slopes_(static_cast<size_t>(settings.windows_per_step), stream) {}
 
     void compare(const PlannedStep& step) {
         const WindowTables* windows = step.windows.tables();
         const dim3 grid(step.blocks_per_window, step.windows.count());
         launch("compare_kernel", compare_kernel, grid, kThreads, 0, stream_, windows, loss_,
-               kMostPixels, canvases_.slopes(), losses_.data());
+               kMostPixels, canvases_.slopes(), sums_.data());
         launch("weigh_kernel", weigh_kernel, step.windows.count(), kThreads, 0, stream_, windows,
-               losses_.data(), step.blocks_per_window, weights_.data());
+               loss_, window_means_, sums_.data(), step.blocks_per_window, slopes_.data());
         launch("weigh_slopes_kernel", weigh_slopes_kernel, grid, kThreads, 0, stream_, windows,
-               kMostPixels, weights_.data(), canvases_.slopes());
+               kMostPixels, slopes_.data(), canvases_.slopes());
     }
 
   private:
     const LossWeights loss_;
+    const float window_means_;
     const Canvases& canvases_;
     const cudaStream_t stream_;
-    DeviceBuffer<double> losses_;
-    DeviceBuffer<float> weights_;
+    DeviceBuffer<WindowSums> sums_;
+    DeviceBuffer<WindowSlopes> slopes_;
 };
 
 // Returns the grid of kernels that process the gaussians of the clusters from `first`
@@ -403,7 +406,7 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison,
     const DeviceTable table(pictures.table, stream);
     const Canvases canvases(windows_per_step, stream);
     StepFrame frame(config, rows, table, stream);
-    Comparison compared(config.loss, windows_per_step, canvases, stream);
+    Comparison compared(config.loss, comparison, canvases, stream);
     const Span<const int64_t>& offset = pictures.table.offset;
     const auto first_moving = static_cast<size_t>(
         std::lower_bound(offset.begin(), offset.end(), static_cast<int64_t>(target.rows.size)) -

@@ -71,6 +71,60 @@ V3DG_HD inline float put_slopes(const LossWeights& loss, const PixelValues& sum,
     return pixel_loss;
 }
 
+// Sums over the pixels of a window.
+struct WindowSums {
+    static constexpr int kValues = 9;
+    double values[kValues];
+
+    // The loss, without the parts of cells and of the whole window.
+    V3DG_HD double& loss() { return values[0]; }
+    V3DG_HD double loss() const { return values[0]; }
+    // Picture minus target, and the target: premultiplied colour, and alpha.
+    V3DG_HD double& difference(int k) { return values[1 + k]; }
+    V3DG_HD double difference(int k) const { return values[1 + k]; }
+    V3DG_HD double& target(int k) { return values[5 + k]; }
+    V3DG_HD double target(int k) const { return values[5 + k]; }
+
+    V3DG_HD void add_pixel(const PixelValues& pixel, const PixelValues& wanted) {
+        for (int k = 0; k < 4; ++k) {
+            difference(k) +=
+                static_cast<double>(pixel.value[k]) - static_cast<double>(wanted.value[k]);
+            target(k) += static_cast<double>(wanted.value[k]);
+        }
+    }
+    V3DG_HD void add(const WindowSums& other) {
+        for (int i = 0; i < kValues; ++i) values[i] += other.values[i];
+    }
+};
+
+// The common part of the gradients of a window's pixels.
+struct WindowSlopes {
+    float weight;       // of the picture
+    float of_means[4];  // gradient of the loss of the window's sums, without the weight
+
+    V3DG_HD float weighed(float slope, int k) const { return weight * (slope + of_means[k]); }
+};
+
+// Sets the gradient of the loss of a window's sums at each pixel. That loss is linear in
+// the difference of the sums, and quadratic where the difference is smaller than
+// kSmallMeans of the target's sum, so that it hardly disturbs windows whose sums are
+// right. The |differences| of pixels and cells are least at medians. These are darker
+// than means, and thinner where gaussians are faint. A colour counts as at least
+// kLeastColor of alpha, because a relative error of black is not visible.
+constexpr double kSmallMeans = 0.02, kLeastColor = 0.1;
+constexpr double kLeastSum = 1e-30;  // keeps the quotient finite where the target is empty
+V3DG_HD inline void put_slopes_of_means(const LossWeights& loss, float means,
+                                        const WindowSums& sums, float of_means[4]) {
+    for (int k = 0; k < 4; ++k) {
+        const float weight = k < 3 ? loss.l1 / 3 : loss.alpha;
+        const double target = max_of(sums.target(k), kLeastColor * sums.target(3));
+        const auto relative =
+            static_cast<float>(sums.difference(k) / max_of(kSmallMeans * target, kLeastSum));
+        // In this order the result is finite for NaN, too.
+        of_means[k] = means * weight * max_of(min_of(relative, 1.0f), -1.0f);
+    }
+}
+
 // Returns the weight of a picture: one over its loss. So the sum over pictures measures
 // relative losses. Otherwise large pictures would get worse, because coarse levels have
 // larger absolute errors in small pictures. If the loss per pixel is below kLeastLoss,
@@ -78,6 +132,15 @@ V3DG_HD inline float put_slopes(const LossWeights& loss, const PixelValues& sum,
 constexpr double kLeastLoss = 1e-4;
 V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
+}
+
+// Returns the common part of the gradients of a window's pixels.
+V3DG_HD inline WindowSlopes slopes_of_window(const LossWeights& loss, float means,
+                                             const WindowSums& sums, double num_pixels) {
+    WindowSlopes slopes;
+    slopes.weight = weight_of_picture(sums.loss(), num_pixels);
+    put_slopes_of_means(loss, means, sums, slopes.of_means);
+    return slopes;
 }
 
 // Sets the gradient of a pixel for the loss "sum of the first channel".

@@ -66,69 +66,80 @@ struct CellPixel {
     }
 };
 
-// Computes the gradients of pixels as if all windows had the weight 1, and the loss of
+// Sums each value over the threads of a block. The first WindowSums::kValues threads
+// write the sums.
+__device__ inline void write_block_sums(const WindowSums& of_thread, WindowSums& sums) {
+    __shared__ double of_warp[WindowSums::kValues][kThreads / 32];
+    for (int i = 0; i < WindowSums::kValues; ++i) {
+        const double of_lanes = warp_sum(of_thread.values[i]);
+        if (threadIdx.x % 32 == 0) of_warp[i][threadIdx.x / 32] = of_lanes;
+    }
+    __syncthreads();
+    if (threadIdx.x >= WindowSums::kValues) return;
+    double sum = 0;
+    for (const double value : of_warp[threadIdx.x]) sum += value;
+    sums.values[threadIdx.x] = sum;
+}
+
+// Computes the gradients of pixels as if all windows had the weight 1, and the sums of
 // each block. One thread per pixel. `planes` has room for `most_pixels` pixels per
 // window.
 __global__ void __launch_bounds__(kThreads)
     compare_kernel(const WindowTables* windows, LossWeights loss, size_t most_pixels, float* planes,
-                   double* loss_of_block) {
+                   WindowSums* sums_of_block) {
     const unsigned w = blockIdx.y;
     const FrameImage& image = windows->image[w];
     const CellPixel p(image);
     PixelValues pixel{};
+    WindowSums sums{};
     if (p.is_in_window) {
         const PixelValues wanted = windows->target[w].at(p.pixel());
         pixel = ReadPlanes{image.planes.color, image.planes.alpha}.at(p.pixel());
+        sums.add_pixel(pixel, wanted);
         for (int k = 0; k < 4; ++k) pixel.value[k] -= wanted.value[k];
     }
     PixelValues of_cell{};
     for (int k = 0; k < 4; ++k) of_cell.value[k] = CellPixel::sum(pixel.value[k]);
-    double pixel_loss = 0;
     if (p.is_in_window) {
-        pixel_loss = put_slopes(loss, of_cell, pixel);
+        sums.loss() = put_slopes(loss, of_cell, pixel);
         const PicturePlanes slopes = planes_of_window(planes, most_pixels, w);
         for (size_t k = 0; k < 3; ++k) slopes.color[3 * p.pixel() + k] = pixel.value[k];
         slopes.alpha[p.pixel()] = pixel.value[3];
     }
-    __shared__ double of_warp[kThreads / 32];
-    pixel_loss = warp_sum(pixel_loss);
-    if (threadIdx.x % 32 == 0) of_warp[threadIdx.x / 32] = pixel_loss;
-    __syncthreads();
-    if (threadIdx.x > 0) return;
-    double sum = 0;
-    for (const double warp_loss : of_warp) sum += warp_loss;
-    loss_of_block[size_t(w) * gridDim.x + blockIdx.x] = sum;
+    write_block_sums(sums, sums_of_block[size_t(w) * gridDim.x + blockIdx.x]);
 }
 
-// Computes the weight of each window from the losses of its blocks. One block per
-// window.
+// Computes the common part of the gradients of each window from the sums of its blocks.
+// One block per window.
 __global__ void __launch_bounds__(kThreads)
-    weigh_kernel(const WindowTables* windows, const double* loss_of_block, unsigned num_blocks,
-                 float* weight) {
+    weigh_kernel(const WindowTables* windows, LossWeights loss, float means,
+                 const WindowSums* sums_of_block, unsigned num_blocks, WindowSlopes* slopes) {
     const FrameImage& image = windows->image[blockIdx.x];
-    __shared__ double of_warp[kThreads / 32];
-    double sum = 0;
+    __shared__ WindowSums of_window;
+    WindowSums sums{};
     for (unsigned i = threadIdx.x; i < num_blocks; i += kThreads)
-        sum += loss_of_block[size_t(blockIdx.x) * num_blocks + i];
-    sum = warp_sum(sum);
-    if (threadIdx.x % 32 == 0) of_warp[threadIdx.x / 32] = sum;
+        sums.add(sums_of_block[size_t(blockIdx.x) * num_blocks + i]);
+    write_block_sums(sums, of_window);
     __syncthreads();
     if (threadIdx.x > 0) return;
-    sum = 0;
-    for (const double warp_loss : of_warp) sum += warp_loss;
-    weight[blockIdx.x] = weight_of_picture(sum, static_cast<double>(image.width) * image.height);
+    slopes[blockIdx.x] =
+        slopes_of_window(loss, means, of_window, static_cast<double>(image.width) * image.height);
 }
 
-// Multiplies the gradients of each window by its weight. One thread per pixel.
+// Adds the gradient of the window's sums to those of its pixels, and multiplies them by
+// the window's weight. One thread per pixel.
 __global__ void __launch_bounds__(kThreads)
-    weigh_slopes_kernel(const WindowTables* windows, size_t most_pixels, const float* weight,
-                        float* planes) {
+    weigh_slopes_kernel(const WindowTables* windows, size_t most_pixels,
+                        const WindowSlopes* of_windows, float* planes) {
     const unsigned w = blockIdx.y;
     const WindowPixel p(*windows, w);
     if (!p.is_in_window()) return;
     const PicturePlanes slopes = planes_of_window(planes, most_pixels, w);
-    for (size_t k = 0; k < 3; ++k) slopes.color[3 * p.pixel + k] *= weight[w];
-    slopes.alpha[p.pixel] *= weight[w];
+    for (int k = 0; k < 3; ++k) {
+        float& slope = slopes.color[3 * p.pixel + k];
+        slope = of_windows[w].weighed(slope, k);
+    }
+    slopes.alpha[p.pixel] = of_windows[w].weighed(slopes.alpha[p.pixel], 3);
 }
 
 // Writes the gradients of the loss "sum of the first channel". One thread per pixel.

@@ -252,6 +252,14 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 
 }  // namespace
 
+// Launches the kernel for shared items.
+template <class Source, class C>
+static void project_shared(const typename Source::Model* models, const ProjectInput& in,
+                           const ProjectOutput& out, unsigned blocks, cudaStream_t stream) {
+    launch_early("project_shared_kernel", project_shared_kernel<Source, C>, blocks, 32 * kWarps, 0,
+                 stream, in, models, out);
+}
+
 // Launches the kernels for one source. `SharedSource` reads the models of shared items;
 // it has no fades, because shared items have weight 1.
 template <class Source, class SharedSource, class C = Pinhole<float>>
@@ -260,9 +268,10 @@ static void project_from(const typename Source::Model* models, const ProjectInpu
     const unsigned blocks = kBlocks * num_multiprocessors();
     launch_early("project_kernel", project_kernel<Source, C>, blocks, 32 * kWarps, 0, stream, in,
                  models, out, out.taken + taken);
-    if (in.has_shared_items)
-        launch_early("project_shared_kernel", project_shared_kernel<SharedSource, C>, blocks,
-                     32 * kWarps, 0, stream, in, models, out);
+    if (in.has_shared_items && out.source != nullptr)
+        project_shared<Placing<SharedSource>, C>(models, in, out, blocks, stream);
+    else if (in.has_shared_items)
+        project_shared<SharedSource, C>(models, in, out, blocks, stream);
 }
 
 template <class Source>

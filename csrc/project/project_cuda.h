@@ -51,7 +51,9 @@ struct ProjectOutput {
     FewTiles* few;           // tiles of each small record (see TileBinInput)
     uint32_t* item_records;  // [items] number of records of each item
     ItemTiles* item_tiles;   // [items] the tiles of each item
-    // The index of each record's gaussian in its model. Null if records.box is null.
+    // The index of each record's gaussian in its model. For a record of a shared item:
+    // 32 times the index of the gaussian in the item, plus the index of the placement
+    // among the sharers. Null if records.box is null.
     uint32_t* source;
     TileCounts tiles;
     LargeRecord* large;

@@ -70,6 +70,7 @@ struct OfRows {
     struct Place {};  // rows are addressed directly
     static constexpr bool kFades = false;
     static constexpr bool kTints = false;
+    static constexpr bool kPlaces = false;
 
     static __device__ Place start(const ItemTables<Model>&) { return {}; }
     static __device__ void prepare() {}
@@ -167,6 +168,7 @@ struct CodeSource {
     using Fetched = uint4;
     static constexpr bool kFades = false;
     static constexpr bool kTints = false;
+    static constexpr bool kPlaces = false;
     struct Place {
         // Cluster of the current row, and the end of that cluster's rows.
         uint32_t cluster, end;
@@ -291,6 +293,12 @@ struct CodeSource {
 template <class Source>
 struct Tinted : Source {
     static constexpr bool kTints = true;
+};
+
+// A source for shared items in frames that need the placement of each record.
+template <class Source>
+struct Placing : Source {
+    static constexpr bool kPlaces = true;
 };
 
 // A source for frames in which items have weights below 1.

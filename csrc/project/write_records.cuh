@@ -91,8 +91,8 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
         const uint32_t depth =
             entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_mask);
         out.few[first + rank] = is_large ? kManyTiles : few_tiles(depth, tile, blocks);
-        if (out.source != nullptr) {  // the frame keeps a tape for the backward pass
-            out.source[first + rank] = g;
+        if (out.source != nullptr) {
+            out.source[first + rank] = Source::kPlaces ? place : g;
             out.records.box[first + rank] = pixels();
         }
     }

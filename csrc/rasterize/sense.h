@@ -14,8 +14,6 @@
 #include "frame/record.h"
 #include "frame/sensor.h"
 #include "frame/tile_list.h"
-#include "math/gaussian.h"
-#include "math/view.h"
 
 namespace v3dg {
 
@@ -32,24 +30,31 @@ V3DG_DECLARE_PER_ISA(void sense_tile(const Record<float>* records, const SensedR
 
 namespace cuda {
 
-// A picture of one model that was drawn with a tape, in device memory.
-struct SenseInput {
-    FrameImage image;  // with planes; its first tile is 0
-    RecordPlanes records;
-    // [num_tiles + 1] first element of each tile in `order`
-    const unsigned long long* tile_first;
-    const uint32_t* order;    // records of each tile, front to back
-    const uint32_t* blended;  // [num_tiles] number of records in `order`
-    const uint32_t* source;   // row of each record's gaussian, for normals
-    GaussianRows<const float> rows;
-    ModelView<float> view;
-    float min_transmittance;
-    Sensor sensor;  // not the channel `clipped`
+struct RasterTape;  // rasterize.h
+
+// The channels and the meshes of a frame's pictures, in device memory. The channel
+// `clipped` is not supported.
+struct FrameSensors {
+    Sensor first;   // of the first picture
+    Sensor second;  // of the second of two eyes
+    // Number of pixels of a picture, if the planes of all pictures follow each other. 0
+    // if there are at most two pictures with planes of their own.
+    size_t num_pixels = 0;
+
+    bool is_on() const { return first.is_on(); }
+    // Returns whether the channels need the normals, and the instances, of records.
+    bool needs_normals() const { return first.planes.normal != nullptr; }
+    bool needs_instances() const { return first.planes.wants_ids(); }
+    V3DG_HD Sensor of(uint32_t picture) const {
+        if (num_pixels > 0) return first.from(picture * num_pixels);
+        return picture == 0 ? first : second;
+    }
 };
 
-// Runs the sensor pass of a picture. All gaussians are of instance 0. Waits, because
-// the frame's next picture may be drawn on another stream.
-void sense(const SenseInput& in, Stream stream);
+// Computes the channels of pictures that were blended with a tape, and mixes meshes
+// into them. `lists` and `tape` are those of rasterize(). Does not wait.
+void sense(const FrameLists& lists, const RasterTape& tape, const SensedRecords& records,
+           const FrameSensors& sensors, Stream stream);
 
 }  // namespace cuda
 

@@ -82,14 +82,16 @@ V3DG_HD V3DG_INLINE Strongest strongest_of(const SensedSums& front, const Sensed
     return out;
 }
 
-// Sets the blended normal of a pixel, of length 1, or 0 if there is none.
+// Sets the blended normal of a pixel, of length 1, or 0 if there is none. `mesh_normal`
+// has any length; null: unknown.
 V3DG_HD V3DG_INLINE void blended_normal(const SensedSums& front, const SensedSums& behind,
                                         const float* mesh_normal, const SensedShares& share,
                                         float normal[3]) {
-    for (int k = 0; k < 3; ++k) {
+    for (int k = 0; k < 3; ++k)
         normal[k] = share.front * front.normal[k] + share.behind * behind.normal[k];
-        if (mesh_normal != nullptr) normal[k] += share.mesh * mesh_normal[k];
-    }
+    const float mesh_length = mesh_normal == nullptr ? 0 : sqrt_of(dot3(mesh_normal, mesh_normal));
+    if (share.mesh > 0 && mesh_length > 0)
+        for (int k = 0; k < 3; ++k) normal[k] += share.mesh / mesh_length * mesh_normal[k];
     const float length = sqrt_of(dot3(normal, normal));
     for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] / length : 0.0f;
 }
@@ -198,6 +200,19 @@ V3DG_HD V3DG_INLINE void write_pixel(const SensedPixel& pixel, size_t at, float 
         write_strongest(strongest_of(pixel.front, pixel.behind, share), at, sensed, sensor);
 }
 
+// Sets the unit normal along an axis of a gaussian, in view space, pointing towards the
+// eye. `axis` is in model space, of any length. `p` is the gaussian's mean in view
+// space.
+V3DG_HD V3DG_INLINE void normal_along(const float axis[3], const ModelView<float>& view,
+                                      const float p[3], float normal[3]) {
+    for (int i = 0; i < 3; ++i)
+        normal[i] = view.linear[3 * i] * axis[0] + view.linear[3 * i + 1] * axis[1] +
+                    view.linear[3 * i + 2] * axis[2];
+    const float length = sqrt_of(dot3(normal, normal));
+    const float factor = (dot3(normal, p) > 0 ? -1.0f : 1.0f) / length;
+    for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] * factor : 0.0f;
+}
+
 // Computes the normal of a gaussian in view space: its shortest axis, the first one of
 // equals, pointing towards the eye. `p` is the gaussian's mean in view space.
 V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float scale[3],
@@ -208,12 +223,39 @@ V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float sca
         if (scale[k] < scale[shortest]) shortest = k;
     float r[9];
     rotation_of_quat(quat, r);
-    for (int i = 0; i < 3; ++i)
-        normal[i] = view.linear[3 * i] * r[shortest] + view.linear[3 * i + 1] * r[3 + shortest] +
-                    view.linear[3 * i + 2] * r[6 + shortest];
-    const float length = sqrt_of(dot3(normal, normal));
-    const float factor = (dot3(normal, p) > 0 ? -1.0f : 1.0f) / length;
-    for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] * factor : 0.0f;
+    const float axis[3] = {r[shortest], r[3 + shortest], r[6 + shortest]};
+    normal_along(axis, view, p, normal);
+}
+
+// Like normal_of_gaussian(), from the factor F of a PackedGaussian. If two axes are
+// equally short, the normal is any vector in their plane.
+//
+// The first column of F is the longest axis; the other two columns span the plane of
+// the other axes. Rotating these two until they are orthogonal makes them axes (a step
+// of Jacobi's method for singular values). The cross product of the two longest axes is
+// exact even if the gaussian is flat.
+V3DG_HD V3DG_INLINE void normal_of_factor(const float f[8], const ModelView<float>& view,
+                                          const float p[3], float normal[3]) {
+    constexpr float kSmallest = 1e-30f;
+    // Relative to the longest axis, so that products of small scales do not vanish.
+    const float unit = 1 / max_of(sqrt_of(dot3(f, f)), kSmallest);
+    const float one[3] = {unit * f[3], unit * f[4], unit * f[5]};
+    const float other[3] = {0, unit * f[6], unit * f[7]};
+    const float difference = dot3(one, one) - dot3(other, other);
+    const float twice = 2 * dot3(one, other);
+    // The longer axis is cosine * one + sine * other. Its squared length is largest at
+    // half the angle of (difference, twice).
+    const float size = sqrt_of(difference * difference + twice * twice);
+    const float cosine2 = size > 0 ? difference / size : 1.0f;  // of the double angle
+    const float cosine = sqrt_of(max_of(0.5f + 0.5f * cosine2, 0.0f));
+    const float sine = sqrt_of(max_of(0.5f - 0.5f * cosine2, 0.0f)) * (twice < 0 ? -1.0f : 1.0f);
+    float longest[3], middle[3], axis[3];
+    for (int k = 0; k < 3; ++k) {
+        longest[k] = unit * f[k];
+        middle[k] = cosine * one[k] + sine * other[k];
+    }
+    cross3(longest, middle, axis);
+    normal_along(axis, view, p, normal);
 }
 
 // A gaussian that is not drawn because its mean is before the near plane, although its

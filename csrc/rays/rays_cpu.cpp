@@ -48,7 +48,7 @@ static V3DG_INLINE void colors_of(const Source& from, const Draw<float>& draw, u
 
 template <class Source>
 static void project_rows(const Source& from, const Draw<float>& draw, uint64_t first,
-                         uint64_t count, const RayGrid& grid, const RayLimits& limits,
+                         uint64_t count, const RayDirections& rays, const RayLimits& limits,
                          std::vector<RayRecord>& records) {
     constexpr int kWidth = kLanes<float>;
     const float filter_rad2 = draw.appearance.filter_px2 * limits.spacing * limits.spacing;
@@ -67,11 +67,11 @@ static void project_rows(const Source& from, const Draw<float>& draw, uint64_t f
         const V nearest = nearest_of(seen, reach2);
         const DirectionBox<V> box = directions_of(seen, reach2);
         unsigned kept = 0;
-        RayGrid::Range range[kWidth];
+        RayRange range[kWidth];
         const auto is_near = nearest <= all_lanes<V>(limits.farthest);
         for (unsigned left = visible & bits_of(is_near); left != 0; left &= left - 1) {
             const int i = __builtin_ctz(left);
-            range[i] = grid.range_of(
+            range[i] = rays.range_of(
                 {box.azimuth0[i], box.azimuth1[i], box.elevation0[i], box.elevation1[i]});
             if (!range[i].is_empty()) kept |= 1u << i;
         }
@@ -84,21 +84,23 @@ static void project_rows(const Source& from, const Draw<float>& draw, uint64_t f
             records.push_back({.shape = lane_of(shape, i),
                                .color = {color[0][i], color[1][i], color[2][i]},
                                .nearest = nearest[i],
-                               .range = range[i]});
+                               .range = range[i],
+                               .order = 0});
         }
     }
 }
 
-void project_to_rays(const Draw<float>& draw, uint64_t skip, uint64_t count, const RayGrid& grid,
-                     const RayLimits& limits, std::vector<RayRecord>& records) {
+void project_to_rays(const Draw<float>& draw, uint64_t skip, uint64_t count,
+                     const RayDirections& rays, const RayLimits& limits,
+                     std::vector<RayRecord>& records) {
     if (draw.codes == nullptr) {
-        project_rows(PlaneSource<float>{*draw.model}, draw, draw.first + skip, count, grid, limits,
+        project_rows(PlaneSource<float>{*draw.model}, draw, draw.first + skip, count, rays, limits,
                      records);
         return;
     }
     for_clusters(*draw.codes, draw.first + skip, count,
                  [&](const CodeSource& source, uint64_t first, uint64_t size) {
-                     project_rows(source, draw, first, size, grid, limits, records);
+                     project_rows(source, draw, first, size, rays, limits, records);
                  });
 }
 
@@ -130,7 +132,8 @@ static void blend_pending(const RayRecord* records, float end, const RayLimits& 
         const float* rgb = records[hit.record].color;
         for (int c = 0; c < 3; ++c) rays.color[ray][c] += weight * rgb[c];
         rays.weighted_range[ray] += weight * hit.range;
-        if (has_returns) scratch.seen[ray].push_back({hit.range, weight, luma_of(rgb)});
+        if (has_returns)
+            scratch.returns[ray].add({hit.range, weight, luma_of(rgb)}, rays.transmittance[ray]);
         rays.transmittance[ray] *= 1 - hit.alpha;
         if (rays.transmittance[ray] < limits.min_transmittance) {
             left = rays.transmittance[ray];
@@ -169,7 +172,7 @@ static V3DG_INLINE void hit_row(const RayRecord& record, uint32_t index, const R
 
 // Returns the vectors of a tile's rows that have a column of the range; `column` is the
 // first of the tile.
-static V3DG_INLINE unsigned vectors_of(const RayGrid::Range& range, int column, int num_columns) {
+static V3DG_INLINE unsigned vectors_of(const RayRange& range, int column, int num_columns) {
     unsigned vectors = 0;
     for (int c = 0; c < kRayTileColumns; c += kLanes<float>) {
         const int first = column + c, last = first + kLanes<float> - 1;
@@ -180,24 +183,25 @@ static V3DG_INLINE unsigned vectors_of(const RayGrid::Range& range, int column, 
     return vectors;
 }
 
-void cast_tile(const RayRecord* records, Span<const uint64_t> entries, const RayGrid& grid,
-               size_t tile, const RayLimits& limits, RayScratch& scratch, const RayPlanes& planes) {
-    const int column = static_cast<int>(tile % grid.tile_columns()) * kRayTileColumns;
-    const int row = static_cast<int>(tile / grid.tile_columns()) * kRayTileRows;
-    const int num_columns = std::min(kRayTileColumns, grid.num_columns() - column);
-    const int num_rows = std::min(kRayTileRows, grid.num_rows() - row);
-    const bool has_returns = planes.returns != nullptr;
+void cast_tile(const RayRecord* records, Span<const uint64_t> entries,
+               const RayDirections& directions, size_t tile, const RayLimits& limits,
+               RayScratch& scratch, const RayPlanes& planes) {
+    const int column = static_cast<int>(tile % directions.tile_columns()) * kRayTileColumns;
+    const int row = static_cast<int>(tile / directions.tile_columns()) * kRayTileRows;
+    const int num_columns = std::min(kRayTileColumns, directions.num_columns() - column);
+    const int num_rows = std::min(kRayTileRows, directions.num_rows() - row);
+    const bool has_returns = planes.has_returns();
     TileRays rays{};
     float left[kRayTileSize];  // transmittance of rays that have ended
     float x[kRayTileSize], y[kRayTileSize];
     for (int r = 0; r < num_rows; ++r)
         for (int c = 0; c < kRayTileColumns; ++c) {
             const int ray = kRayTileColumns * r + c;
-            x[ray] = grid.elevation_cosine()[row + r] * grid.azimuth_cosine()[column + c];
-            y[ray] = grid.elevation_cosine()[row + r] * grid.azimuth_sine()[column + c];
+            x[ray] = directions.elevation_cosine[row + r] * directions.azimuth_cosine[column + c];
+            y[ray] = directions.elevation_cosine[row + r] * directions.azimuth_sine[column + c];
             rays.transmittance[ray] = c < num_columns ? 1.0f : 0.0f;
             scratch.pending[ray].clear();
-            scratch.seen[ray].clear();
+            if (has_returns) scratch.returns[ray].start(planes.rule);
         }
     rays.num_open = num_rows * num_columns;
     const auto blend_before = [&](float end) {
@@ -215,18 +219,18 @@ void cast_tile(const RayRecord* records, Span<const uint64_t> entries, const Ray
         const RayRecord& record = records[index];
         if (e % kFlushed == kFlushed - 1) blend_before(record.nearest);
         const int last = std::min(record.range.row1 - row, num_rows - 1);
-        const unsigned vectors = vectors_of(record.range, column, grid.num_columns());
+        const unsigned vectors = vectors_of(record.range, column, directions.num_columns());
         for (int r = std::max(record.range.row0 - row, 0); r <= last; ++r) {
             const int first_ray = kRayTileColumns * r;
             hit_row(record, index, limits, vectors, first_ray, x + first_ray, y + first_ray,
-                    grid.elevation_sine()[row + r], rays, scratch);
+                    directions.elevation_sine[row + r], rays, scratch);
         }
     }
     blend_before(INFINITY);
     for (int r = 0; r < num_rows; ++r)
         for (int c = 0; c < num_columns; ++c) {
             const int ray = kRayTileColumns * r + c;
-            const size_t out = static_cast<size_t>(row + r) * grid.num_columns() + column + c;
+            const size_t out = directions.place(row + r, column + c);
             const float passed = rays.is_open(ray) ? rays.transmittance[ray] : left[ray];
             const float alpha = 1 - passed;
             planes.alpha[out] = alpha;
@@ -234,9 +238,12 @@ void cast_tile(const RayRecord* records, Span<const uint64_t> entries, const Ray
                 for (int k = 0; k < 3; ++k) planes.color[3 * out + k] = rays.color[ray][k];
             if (planes.range != nullptr)
                 planes.range[out] = alpha > 0 ? rays.weighted_range[ray] / alpha : 0;
-            if (has_returns)
-                find_returns({scratch.seen[ray].data(), scratch.seen[ray].size()}, planes.rule,
-                             planes.returns + kMostReturns * out);
+            if (!has_returns) continue;
+            scratch.returns[ray].finish();
+            for (int k = 0; k < kMostReturns; ++k) {
+                planes.return_range[k][out] = scratch.returns[ray].found(k).range;
+                planes.return_intensity[k][out] = scratch.returns[ray].found(k).intensity;
+            }
         }
 }
 

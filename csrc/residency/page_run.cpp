@@ -1,11 +1,17 @@
+// Reads, verifies and decodes adjacent pages of a file; encodes, hashes and writes
+// them. A thread works on several pages at once, because they are hashed in parallel
+// lanes.
+
 #include "residency/page_run.h"
 
 #include <algorithm>
+#include <cstring>
 #include <vector>
 
 #include "base/buffer.h"
 #include "base/parallel_for.h"
 #include "base/threads.h"
+#include "io/blake2b.h"
 #include "quantize/quantize.h"
 
 namespace v3dg {
@@ -81,6 +87,53 @@ void read_pages(const File& file, const PageRun& run, PageCodec codec,
         read_few(
             file, run, first, count, reinterpret_cast<unsigned char*>(words.data()),
             [&](size_t page, const unsigned char* bytes) { decode(run, page, codec, bytes, out); });
+    });
+}
+
+// Encodes one page. `clusters` has the first row of each of its clusters, and the end.
+static void encode(Span<const int64_t> clusters, PageCodec codec,
+                   const GaussianRows<const float>& rows, unsigned char* bytes) {
+    if (codec == PageCodec::quantized) {
+        cpu::encode_page(rows, {clusters, reinterpret_cast<uint32_t*>(bytes), rows.sh_degree});
+        return;
+    }
+    const auto first = static_cast<size_t>(clusters[0]);
+    const auto count = static_cast<size_t>(clusters[clusters.size - 1]) - first;
+    const auto copy = [&](const float* source, size_t width) {
+        const size_t size = count * width * sizeof(float);
+        std::memcpy(bytes, source + first * width, size);
+        bytes += size;
+    };
+    copy(rows.means, 3);
+    copy(rows.quats, 4);
+    copy(rows.scales, 3);
+    copy(rows.opacities, 1);
+    copy(rows.sh, rows.num_sh());
+}
+
+void write_pages(const File& file, const PageRun& run, PageCodec codec,
+                 const GaussianRows<const float>& rows, uint8_t* hashes) {
+    std::vector<int64_t> row_of_cluster;
+    for (const int64_t row : run.offset) row_of_cluster.push_back(row - run.offset[0]);
+    for_few_pages(run, [&](size_t first, size_t count) {
+        const auto size = static_cast<size_t>(run.places[first + count] - run.places[first]);
+        Buffer<uint32_t> words(size / sizeof(uint32_t) + 1);
+        auto* const bytes = reinterpret_cast<unsigned char*>(words.data());
+        std::memset(bytes, 0, size);
+        Span<const uint8_t> pages[kFew];
+        for (size_t k = 0; k < count; ++k) {
+            const size_t page = first + k;
+            unsigned char* const of_page = bytes + (run.places[page] - run.places[first]);
+            encode({row_of_cluster.data() + run.first_cluster[page], run.clusters(page).size},
+                   codec, rows, of_page);
+            pages[k] = {of_page, run.num_bytes(page)};
+        }
+        PageHash digests[kFew];
+        blake2b({pages, count}, digests);
+        for (size_t k = 0; k < count; ++k)
+            std::copy(digests[k].begin(), digests[k].end(), hashes + kPageHashBytes * (first + k));
+        file.write_at(static_cast<size_t>(run.places[first]), reinterpret_cast<const char*>(bytes),
+                      size);
     });
 }
 

@@ -36,6 +36,13 @@ struct PageRun {
 void read_pages(const File& file, const PageRun& run, PageCodec codec,
                 const GaussianRows<float>& out);
 
+// Encodes and writes all pages, and computes their hashes, [n][16]. `rows` has the
+// gaussians of the run. Precondition: each page has at least the bytes that its codec
+// needs; the others are written as zeros. Throws std::system_error, and
+// std::invalid_argument if a codec cannot represent a value.
+void write_pages(const File& file, const PageRun& run, PageCodec codec,
+                 const GaussianRows<const float>& rows, uint8_t* hashes);
+
 // Reads and verifies all pages, without decoding. Throws like read_pages().
 void read_codes(const File& file, const PageRun& run, Span<int32_t> words);
 

@@ -1,3 +1,6 @@
+// Implements scene_tables.h: uploads instances and poses, and finds bounds on what one
+// camera sees.
+
 #include "residency/scene_tables.h"
 
 #include <algorithm>
@@ -74,10 +77,17 @@ void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion
     scale_ = on_device(scale, 2);
 }
 
+void SceneTables::set_labels(Span<const int32_t> label, cudaStream_t stream) {
+    const DeviceGuard guard(device_);
+    const StreamLock lock(busy_, stream);
+    label_.copy_from(label, stream);
+    num_labels_ = label.size;
+}
+
 size_t SceneTables::bytes() const {
     size_t bytes =
         bundles_on_device_.bytes() + bundle_.bytes() + importance_.bytes() + factors_.bytes();
-    bytes += environment_order_.bytes() + environment_begin_.bytes();
+    bytes += environment_order_.bytes() + environment_begin_.bytes() + label_.bytes();
     for (const DeviceBuffer<double>& poses : uploaded_) bytes += poses.bytes();
     return bytes;
 }
@@ -92,7 +102,8 @@ SceneOnDevice SceneTables::on_device() const {
                           .importance = {importance_.data(), count},
                           .factors = {factors_.data(), num_factors_}},
             .environments = {.order = {environment_order_.data(), count},
-                             .begin = {environment_begin_.data(), num_environment_begins_}}};
+                             .begin = {environment_begin_.data(), num_environment_begins_}},
+            .label = {label_.data(), num_labels_}};
 }
 
 }  // namespace cuda

@@ -24,6 +24,7 @@ struct SceneOnDevice {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     EnvironmentTable environments;
+    Span<const int32_t> label;  // label of each instance; empty if none has one
 };
 
 // The number of clusters that a warp tests together.
@@ -58,6 +59,9 @@ class SceneTables {
     // may reuse on return, or in device memory, which must not change.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                    cudaStream_t stream);
+    // Sets the label of each instance; empty if no instance has one. The caller may
+    // reuse host memory on return.
+    void set_labels(Span<const int32_t> label, cudaStream_t stream);
 
     int device() const { return device_; }
     // Returns the device memory in bytes, without the tables of bundles, which other
@@ -89,6 +93,8 @@ class SceneTables {
     DeviceBuffer<InstanceFactors> factors_;
     DeviceBuffer<int32_t> environment_order_, environment_begin_;
     size_t num_environment_begins_ = 0;
+    DeviceBuffer<int32_t> label_;
+    size_t num_labels_ = 0;
     SeenBounds seen_by_all_{}, seen_in_environment_{};
     size_t num_factors_ = 0;
     DeviceBuffer<double> uploaded_[3];

@@ -13,6 +13,7 @@ SOURCES = (
     "wasm/core.cpp",
     "base/isa.cpp",
     "base/thread_pool.cpp",
+    "cluster/check_tables.cpp",
     "io/blake2b.cpp",
     "quantize/quantize_cpu.cpp",
     "residency/cluster_bounds.cpp",

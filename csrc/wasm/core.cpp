@@ -4,8 +4,8 @@
 //
 // All pointers are addresses in the module's memory, from v3dg_allocate(). Tables are
 // borrowed, so they must stay there as long as the bundle. The caller checks sizes and
-// indices: functions of this module trust them. core.mjs is the interface for
-// JavaScript.
+// indices: functions of this module trust them. core.js in
+// v3dg/export/web is the interface for JavaScript.
 
 #include <cstdint>
 #include <memory>
@@ -13,6 +13,7 @@
 
 #include "base/host_memory.h"
 #include "camera/camera_arrays.h"
+#include "cluster/check_tables.h"
 #include "io/blake2b.h"
 #include "quantize/quantize.h"
 #include "residency/cluster_table.h"
@@ -31,7 +32,7 @@ using namespace v3dg;
 
 namespace {
 
-// The tables of a bundle, in the order of core.mjs.
+// The tables of a bundle, in the order of core.js.
 struct BundleArrays {
     uint32_t num_groups, num_clusters;
     const float *ball, *weight;
@@ -72,7 +73,19 @@ struct WebBundle {
     Span<uint32_t> needs;
 };
 
-// The instances of a scene, in the order of core.mjs.
+// The tables of a file, in the order of core.js. They may have any contents.
+struct FileArrays {
+    uint32_t num_groups, num_clusters;
+    const int64_t* offset;
+    const int32_t *level, *own_group, *parent_group;
+    const float *box, *filter_px2;
+    const uint8_t* antialiased;
+    const float *ball, *weight;
+    const int32_t *parent, *group_level;
+    const float* error;
+};
+
+// The instances of a scene, in the order of core.js.
 struct InstanceArrays {
     uint32_t count;
     const int32_t* bundle;
@@ -81,7 +94,7 @@ struct InstanceArrays {
     const float* factors;  // [I * 4] null if all are 1
 };
 
-// A pinhole camera and the rule of a cut, in the order of core.mjs.
+// A pinhole camera and the rule of a cut, in the order of core.js.
 struct ViewValues {
     double viewmat[16], k[9];
     double near_depth;
@@ -136,7 +149,7 @@ struct WebScene {
     }
 };
 
-// The result of a selection, in the order of core.mjs.
+// The result of a selection, in the order of core.js.
 struct CutValues {
     double num_gaussians;
     float tolerance_px2;
@@ -150,6 +163,25 @@ struct CutValues {
 // Returns memory that is aligned to 64 bytes, or null.
 V3DG_EXPORT(v3dg_allocate) void* v3dg_allocate(uint32_t bytes) { return allocate_pages(bytes); }
 V3DG_EXPORT(v3dg_free) void v3dg_free(void* memory) { free_pages(memory); }
+
+// Returns if the tables are valid; otherwise ends by a trap. The number of gaussians is
+// what the tables say.
+V3DG_EXPORT(v3dg_check_tables) void v3dg_check_tables(const FileArrays* in) {
+    const size_t groups = in->num_groups, clusters = in->num_clusters;
+    check_tables({.offset = {in->offset, clusters + 1},
+                  .level = {in->level, clusters},
+                  .own_group = {in->own_group, clusters},
+                  .parent_group = {in->parent_group, clusters},
+                  .box = {reinterpret_cast<const Box*>(in->box), clusters},
+                  .filter_px2 = {in->filter_px2, clusters},
+                  .antialiased = {in->antialiased, clusters},
+                  .ball = {reinterpret_cast<const Ball*>(in->ball), groups},
+                  .weight = {in->weight, groups},
+                  .parent = {in->parent, groups},
+                  .group_level = {in->group_level, groups},
+                  .error = {in->error, 2 * groups}},
+                 in->offset[clusters]);
+}
 
 V3DG_EXPORT(v3dg_make_bundle) WebBundle* v3dg_make_bundle(const BundleArrays* arrays) {
     return new WebBundle(*arrays);
@@ -193,13 +225,11 @@ void v3dg_select(WebScene* scene, const ViewValues* view, CutValues* out) {
             .weight = cut.weight.empty() ? nullptr : cut.weight.data()};
 }
 
-// Decodes the gaussians of a coded page. `offset` has the first row of each cluster and
-// the end. Returns the number of clusters, or the index of the first cluster whose
-// ranges are invalid; then nothing is decoded.
-V3DG_EXPORT(v3dg_decode_page)
-uint32_t v3dg_decode_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
-                          int32_t sh_degree, float* means, float* quats, float* scales,
-                          float* opacities, float* sh) {
+// Returns the number of clusters of a coded page, or the index of the first cluster whose
+// ranges are invalid. `offset` is as for v3dg_decode_page().
+V3DG_EXPORT(v3dg_check_page)
+uint32_t v3dg_check_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
+                         int32_t sh_degree) {
     const PageCodes<const uint32_t> page{{offset, num_clusters + size_t(1)}, words, sh_degree};
     for (uint32_t c = 0; c < num_clusters; ++c) {
         const uint32_t* ranges = page.ranges(c);
@@ -208,6 +238,19 @@ uint32_t v3dg_decode_page(const int64_t* offset, uint32_t num_clusters, const ui
                        sh_degree))
             return c;
     }
+    return num_clusters;
+}
+
+// Decodes the gaussians of a coded page. `offset` has the first row of each cluster and
+// the end. Returns the number of clusters, or the index of the first cluster whose
+// ranges are invalid; then nothing is decoded.
+V3DG_EXPORT(v3dg_decode_page)
+uint32_t v3dg_decode_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
+                          int32_t sh_degree, float* means, float* quats, float* scales,
+                          float* opacities, float* sh) {
+    const uint32_t num_valid = v3dg_check_page(offset, num_clusters, words, sh_degree);
+    if (num_valid < num_clusters) return num_valid;
+    const PageCodes<const uint32_t> page{{offset, num_clusters + size_t(1)}, words, sh_degree};
     cpu::decode_page(page, {.means = means,
                             .quats = quats,
                             .scales = scales,

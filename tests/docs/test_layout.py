@@ -87,7 +87,17 @@ MAY_INCLUDE = {
         "draw",
         "levels",
     },
-    "wasm": {"base", "math", "camera", "io", "frame", "quantize", "residency", "select"},
+    "wasm": {
+        "base",
+        "math",
+        "camera",
+        "io",
+        "frame",
+        "cluster",
+        "quantize",
+        "residency",
+        "select",
+    },
 }
 NOT_OPERATIONS = {
     "base",

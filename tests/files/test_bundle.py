@@ -906,15 +906,15 @@ def test_an_interrupted_save_changes_nothing(saved, monkeypatch):
     before = path.read_bytes()
     num_calls = 0
 
-    def stop_at_second(pieces):
+    def stop_at_second(*arguments):
         nonlocal num_calls
         num_calls += 1
         if num_calls == 2:
             raise Stop
-        return page_hash(pieces)
+        return bundle_file.write_pages(*arguments)
 
-    page_hash = bundle_file.page_hash
-    monkeypatch.setattr(bundle_file, "page_hash", stop_at_second)
+    monkeypatch.setattr("v3dg.bundle.bundle._RUN_BYTES", 1)
+    monkeypatch.setattr("v3dg.bundle.bundle.write_pages", stop_at_second)
     for target in (path, path.with_name("new.v3dg")):
         num_calls = 0
         with pytest.raises(Stop):

@@ -21,6 +21,7 @@ import v3dg.levels
 from benchmarks.worlds.procedural import make_asset
 from random_bundle import random_gaussians
 from v3dg import BuildConfig, _files, build_bundle
+from v3dg.bundle import file
 from v3dg.bundle.file import BundlePlan
 from v3dg.levels import leaves_on_disk
 from v3dg.levels.digest import digest_of
@@ -504,11 +505,23 @@ def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, 
     def kind_of(descriptor, offset):
         name = os.path.basename(os.readlink(f"/proc/self/fd/{descriptor}"))
         is_journal = offset >= len(expected)
-        return name if name in leaves_on_disk._NAMES else "journal" if is_journal else "pages"
+        return name if name in leaves_on_disk._NAMES else "journal" if is_journal else "tables"
 
     def noted(descriptor, data, offset):
         kinds.append(kind_of(descriptor, offset))
         write(descriptor, data, offset)
+
+    def noted_pages(*arguments):
+        kinds.append("pages")
+        return file.write_pages(*arguments)
+
+    def full_pages(path, descriptor, run, codec, gaussians):
+        left[0] -= kind == "pages"
+        if kind != "pages" or left[0] >= 0:
+            return file.write_pages(path, descriptor, run, codec, gaussians)
+        first, last = run.places[[0, -1]].tolist()
+        os.pwrite(descriptor, b"?" * ((last - first) // 2), first)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def full(descriptor, data, offset):
         # The head of the file is written again over its own bytes, which needs no room.
@@ -522,9 +535,11 @@ def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, 
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(_files, "write_at", noted)
+    monkeypatch.setattr("v3dg.levels.unfinished.write_pages", noted_pages)
     assert bounded(tmp_path / "whole2.v3dg") == expected
-    assert set(kinds) == {*leaves_on_disk._NAMES, "journal", "pages"}
+    assert set(kinds) == {*leaves_on_disk._NAMES, "journal", "pages", "tables"}
     monkeypatch.setattr(_files, "write_at", full)
+    monkeypatch.setattr("v3dg.levels.unfinished.write_pages", full_pages)
     output = tmp_path / "out" / "out.v3dg"
     output.parent.mkdir()
     for kind in sorted(set(kinds)):

@@ -183,6 +183,27 @@ def test_panorama_shows_all_directions(render):
     assert not covered[:10].any()
 
 
+def test_panoramas_of_a_budget_are_combined_from_pinholes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 2000, size=0.4), 32).write("blob.v3dg")
+    command = ["render", "blob.v3dg", "--device", "cpu", "--size", "128", "64", "--json"]
+    command += ["--eye", "0", "0", "3", "--up", "y", "--projection", "equirectangular"]
+    results = {}
+    for name, options in (("rays", []), ("pinholes", ["--budget", "900"])):
+        assert cli.main([*command, *options, "-o", f"{name}.png"]) == 0
+        results[name] = json.loads(capsys.readouterr().out)["pictures"][0]
+    assert "draw_ms" not in results["rays"]
+    assert results["rays"]["gaussians_selected"] > 900
+    assert results["pinholes"]["gaussians_selected"] <= 26 * 900
+    assert results["pinholes"]["draw_ms"] > 0
+    difference = np.abs(pixels("rays.png").astype(int) - pixels("pinholes.png"))
+    assert 0 < difference.mean() < 20
+    command.remove("--json")
+    assert cli.main([*command, "--budget", "900"]) == 0
+    assert "combined from 26 pinholes" in capsys.readouterr().out
+
+
 def test_names_of_photographs_give_no_second_suffix(tmp_path):
     paths = picture_paths(tmp_path / "x.png", ["a.png", "b.JPG", "c.d", "2/e.jpeg"])
     assert [path.name for path in paths] == ["x_a.png", "x_b.png", "x_c.d.png", "x_2_e.png"]

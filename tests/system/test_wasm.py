@@ -1,5 +1,6 @@
 """The core in WebAssembly decides like `v3dg.select`, and decodes pages to the same
-bits. V3DG_WASM_VIEWS sets the number of views."""
+bits, in Node.js and in a worker of Chromium. V3DG_WASM_VIEWS sets the number of
+views."""
 
 import gzip
 import importlib.util
@@ -13,13 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import chromium
 import v3dg
 from random_bundle import random_bundle, random_gaussians
 from v3dg import _core
 from v3dg.bundle.codec import codec_of
+from web_server import serving
 
 ROOT = Path(__file__).parents[2]
 WASM = ROOT / "csrc" / "wasm"
+CORE = ROOT / "v3dg" / "export" / "web" / "core.js"
+SUPPORT = ROOT / "tests" / "support"
 NUM_VIEWS = int(os.environ.get("V3DG_WASM_VIEWS", "1000"))
 VIEWS_OF_A_SCENE = 50
 TYPES = {
@@ -141,7 +146,7 @@ def random_rule(rng):
 
 
 def view_of(camera, rule):
-    """Return a view for core.mjs."""
+    """Return a view for core.js."""
     view = {
         "viewmat": np.asarray(camera.viewmat, np.float64).reshape(-1).tolist(),
         "k": np.asarray(camera.K, np.float64).reshape(-1).tolist(),
@@ -201,38 +206,76 @@ def trial_scenes(rng, bundles, arrays):
 
 
 def run_node(module, folder, arrays, trials):
+    """Write cuts.bin and rows.bin to the folder; return the report."""
     arrays.write(folder / "arrays.bin")
     (folder / "trials.json").write_text(json.dumps(trials))
-    program = ROOT / "tests" / "support" / "wasm_trials.mjs"
+    programs = [SUPPORT / "wasm_node.mjs", CORE, SUPPORT / "wasm_trials.mjs"]
     done = subprocess.run(
-        ["node", program, WASM / "core.mjs", module, folder],
-        capture_output=True,
-        text=True,
-        check=False,
+        ["node", *programs, module, folder], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
-def test_decisions_have_the_bits_of_select(module, tmp_path, record_property):
+WORKER = """
+import * as module from "./core.js";
+import { runTrials } from "./wasm_trials.mjs";
+const bytes = async (name) => (await fetch(name)).arrayBuffer();
+try {
+  const trials = await (await fetch("trials.json")).json();
+  const code = await bytes("v3dg.wasm");
+  const { cuts, rows, report } = await runTrials(module, code, trials, await bytes("arrays.bin"));
+  await fetch("cuts.bin", { method: "PUT", body: cuts });
+  await fetch("rows.bin", { method: "PUT", body: rows });
+  postMessage(report);
+} catch (error) {
+  postMessage({ error: String(error) });
+}
+"""
+RUN_WORKER = """() => new Promise((resolve) => {
+  const worker = new Worker("worker.js", { type: "module" });
+  worker.onmessage = ({ data }) => resolve(data);
+  worker.onerror = ({ message }) => resolve({ error: message });
+})"""
+
+
+def run_chromium(browser, module, folder, arrays, trials):
+    """Do the same as `run_node` in a worker of a page."""
+    arrays.write(folder / "arrays.bin")
+    (folder / "trials.json").write_text(json.dumps(trials))
+    (folder / "worker.js").write_text(WORKER)
+    (folder / "index.html").write_text("<!doctype html><title>trials</title>")
+    shutil.copy(module, folder / "v3dg.wasm")
+    for path in (CORE, SUPPORT / "wasm_trials.mjs"):
+        shutil.copy(path, folder)
+    with serving(folder, accepts=("cuts.bin", "rows.bin")) as server:
+        page = browser.new_page()
+        page.goto(server.url)
+        report = page.evaluate(RUN_WORKER)
+        page.close()
+    assert "error" not in report, report["error"]
+    return report
+
+
+def random_trials():
+    """Return arrays and trials of selection, and the expected bytes of each cut."""
     rng = np.random.default_rng(0)
     bundles = [random_bundle(seed, num_levels=1 + seed % 5) for seed in range(24)]
     arrays = Arrays()
-    trials = {
-        "bundles": [
-            tables_of(bundle, arrays, by_pages=seed % 2 == 1) for seed, bundle in enumerate(bundles)
-        ],
-        "scenes": [],
-        "pages": [],
-    }
+    tables = [
+        tables_of(bundle, arrays, by_pages=seed % 2 == 1) for seed, bundle in enumerate(bundles)
+    ]
+    scenes = []
     expected = []
     for scene, cuts in trial_scenes(rng, bundles, arrays):
-        trials["scenes"].append(scene)
+        scenes.append(scene)
         expected += cuts
-    report = run_node(module, tmp_path, arrays, trials)
-    record_property("cuts", report["numCuts"])
+    return arrays, {"bundles": tables, "scenes": scenes, "pages": []}, expected
+
+
+def check_cuts(folder, report, expected):
     assert report["numCuts"] == len(expected) >= NUM_VIEWS
-    got = (tmp_path / "cuts.bin").read_bytes()
+    got = (folder / "cuts.bin").read_bytes()
     end = 0
     for number, cut in enumerate(expected):
         assert got[end : end + len(cut)] == cut, f"view {number}"
@@ -240,6 +283,26 @@ def test_decisions_have_the_bits_of_select(module, tmp_path, record_property):
     assert end == len(got)
     sizes = {len(cut) for cut in expected}
     assert len(sizes) > 100  # the trials differ
+
+
+def test_decisions_have_the_bits_of_select(module, tmp_path, record_property):
+    arrays, trials, expected = random_trials()
+    report = run_node(module, tmp_path, arrays, trials)
+    record_property("seconds", report["seconds"])
+    check_cuts(tmp_path, report, expected)
+
+
+@pytest.mark.skipif(chromium.PROGRAM is None, reason="chromium is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("playwright") is None, reason="playwright is not installed"
+)
+def test_decisions_in_a_worker_of_a_page_have_the_bits_of_select(
+    module, browser, tmp_path, record_property
+):
+    arrays, trials, expected = random_trials()
+    report = run_chromium(browser, module, tmp_path, arrays, trials)
+    record_property("seconds", report["seconds"])
+    check_cuts(tmp_path, report, expected)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -397,12 +397,18 @@ def test_what_is_dropped_has_the_share_together(bundle):
             np.testing.assert_array_equal(left.level_gaussians(level).means, kept)
 
 
+def comparison(windows_per_step=1, cuts_per_view=8, window_means=1.0):
+    return _core.CutComparison(
+        windows_per_step=windows_per_step, cuts_per_view=cuts_per_view, window_means=window_means
+    )
+
+
 def arguments(bundle, device, config, pictures):
     gaussians = on(device, bundle.gaussians.subset(np.arange(bundle.num_gaussians)))
     leaves = gaussians.subset(slice(0, len(bundle.level_gaussians(0))))
     given = {
         "config": fit_config(config, 0, 1),
-        "comparison": _core.CutComparison(windows_per_step=1, cuts_per_view=8),
+        "comparison": comparison(),
         "target": _core.FitTarget(leaves.rows, 0.0, False),
         "gaussians": gaussians.rows,
         "radius": np.full(bundle.num_gaussians, 2.0, np.float32),
@@ -418,8 +424,8 @@ def planned_views(pictures, num_windows):
     return [pictures.view(number, number % 8) for number in range(num_windows)]
 
 
-def loss_of_window(window, drawn, leaves, samples, camera):
-    """Return the loss of a window relative to its number of pixels, computed with
+def loss_of_window(window, drawn, leaves, samples, camera, window_means):
+    """Return the loss of a window relative to its loss of pixels, computed with
     torch."""
     import torch
 
@@ -439,15 +445,26 @@ def loss_of_window(window, drawn, leaves, samples, camera):
         means, torch.zeros_like(means), reduction="none", beta=1e-4
     )
     of_cells = 16 * of_each.sum((1, 2)) @ weights
-    loss = of_pixels + of_cells / (window.width * window.height)
+    sums = differences.sum((0, 1))
+    target = torch.cat([color, alpha[..., None]], dim=-1).sum((0, 1))
+    small = 0.02 * torch.maximum(target, 0.1 * target[3])
+    of_means = (small * huber(sums / small)) @ weights
+    num_pixels = window.width * window.height
+    loss = of_pixels + (of_cells + window_means * of_means) / num_pixels
     return loss / (of_pixels.detach() + 1e-4)
+
+
+def huber(x):
+    """Return a function that is x² / 2 up to 1, and linear beyond it."""
+    size = abs(x)
+    return size.clip(max=1) * (size - size.clip(max=1) / 2)
 
 
 class Slopes:
     """The gradients of the loss of a step's windows, computed with torch, and the
     number of windows that show each gaussian."""
 
-    def __init__(self, bundle, pictures, camera, num_windows):
+    def __init__(self, bundle, pictures, camera, num_windows, window_means):
         import torch
 
         offset = bundle.clusters.offset
@@ -467,7 +484,7 @@ class Slopes:
                 filter_px2=0.1,
                 antialiased=True,
             )
-            loss = loss + loss_of_window(window, drawn, leaves, samples, camera)
+            loss = loss + loss_of_window(window, drawn, leaves, samples, camera, window_means)
         loss.backward()
         gradients = (tensor.grad.numpy() for tensor in tensors)
         self.by_name = dict(zip(vars(bundle.gaussians), gradients, strict=True))
@@ -489,8 +506,8 @@ def steps_of(start, moved):
     }
 
 
-@pytest.mark.parametrize("num_windows", [1, 5, 8])
-def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows):
+@pytest.mark.parametrize(("num_windows", "window_means"), [(1, 0), (1, 1), (5, 4), (8, 1)])
+def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows, window_means):
     """The first step of Adam has the sign of the gradient. Its length is the step size
     times the square root of the number of windows that show the gaussian."""
     pytest.importorskip("torch")
@@ -498,12 +515,12 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows):
     camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=160, height=160)[0]
     pictures = pictures_of(bundle, [camera])
     gaussians, given = arguments(bundle, device, config, pictures)
-    given["comparison"] = _core.CutComparison(windows_per_step=num_windows, cuts_per_view=8)
+    given["comparison"] = comparison(windows_per_step=num_windows, window_means=window_means)
     _core.refine_cuts(**given)
     start = bundle.gaussians
     moved = host(gaussians)
 
-    slopes = Slopes(bundle, pictures, camera, num_windows)
+    slopes = Slopes(bundle, pictures, camera, num_windows, window_means)
     moves = slopes.num_windows > 0
     moves[: len(bundle.level_gaussians(0))] = False
     if num_windows > 1:
@@ -560,7 +577,7 @@ def test_steps_of_several_windows_are_the_same_with_any_number_of_them_ahead(bun
 
     def moved():
         gaussians, given = arguments(bundle, device, config, pictures_of(bundle))
-        given["comparison"] = _core.CutComparison(windows_per_step=4, cuts_per_view=3)
+        given["comparison"] = comparison(windows_per_step=4, cuts_per_view=3)
         _core.refine_cuts(**given)
         assert given["progress"].groups_done == 4 * 90
         return np.concatenate([array.ravel() for array in vars(host(gaussians)).values()])
@@ -576,7 +593,7 @@ def test_both_devices_take_the_same_steps(bundle):
     moved = {}
     for device in ("cpu", "cuda"):
         gaussians, given = arguments(bundle, device, config, pictures_of(bundle))
-        given["comparison"] = _core.CutComparison(windows_per_step=8, cuts_per_view=2)
+        given["comparison"] = comparison(windows_per_step=8, cuts_per_view=2)
         _core.refine_cuts(**given)
         moved[device] = host(gaussians)
     for name, start in vars(bundle.gaussians).items():
@@ -591,12 +608,13 @@ def test_both_devices_take_the_same_steps(bundle):
         ({"windows_per_step": 0}, "windows_per_step: expected 1 to 32, got 0"),
         ({"windows_per_step": 33}, "windows_per_step: expected 1 to 32, got 33"),
         ({"cuts_per_view": 0}, "cuts_per_view: expected 1 to 128, got 0"),
+        ({"window_means": -1.0}, "window_means: expected a finite number of at least 0, got -1"),
+        ({"window_means": np.inf}, "window_means: expected a finite number of at least 0, got inf"),
     ],
 )
 def test_a_comparison_is_refused_that_makes_no_sense(change, message):
-    settings = {"windows_per_step": 1, "cuts_per_view": 8}
     with pytest.raises(ValueError, match=message):
-        _core.CutComparison(**(settings | change))
+        comparison(**change)
 
 
 def test_the_core_refuses_what_does_not_fit(bundle, device):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import v3dg
+from devices import host
 from reference import rays as reference_rays
 from scenes_lod import blob, lod_bundle, random_scene
 from v3dg import Camera, EquirectangularCamera, Gaussians, Lidar, Scene
@@ -26,6 +27,24 @@ def pose_of(rng, eye):
     pose[:3, :3] = rotation_from_quaternion(_unit(rng.normal(size=4)))
     pose[:3, 3] = eye
     return pose
+
+
+PLANES = ("range", "intensity", "second_range", "second_intensity", "alpha")
+
+
+def scanned_on(device, subject, lidar, pose, **options):
+    """Return a scan whose arrays are NumPy's."""
+    made = v3dg.scan(subject, lidar, pose, device=device, **options)
+    return replace(made, **{name: host(getattr(made, name)) for name in PLANES})
+
+
+def drawn_on(device, subject, camera, **options):
+    """Return colour, alpha and, if requested, depth as NumPy arrays."""
+    image = v3dg.render(subject, camera, device=device, **options)
+    depth = None
+    if options.get("depth"):
+        depth = host(image.depth)
+    return v3dg.Image(host(image.color), host(image.alpha), depth)
 
 
 def _unit(vector):
@@ -70,11 +89,11 @@ def assert_like(values, reference, cutoff, bound):
 
 
 @pytest.mark.parametrize("size", [0.02, 0.2, 0.8])
-def test_a_panorama_is_what_rays_in_float64_see(size):
+def test_a_panorama_is_what_rays_in_float64_see(device, size):
     rng = np.random.default_rng(3)
     gaussians = around(rng, 80, size)
     camera = EquirectangularCamera(np.eye(4), 48)
-    image = v3dg.render(gaussians, camera, depth=True)
+    image = drawn_on(device, gaussians, camera, depth=True)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     directions = camera.directions(np.column_stack([columns.ravel(), rows.ravel()]))
     exact = reference_rays.cast(gaussians, np.zeros(3), directions)
@@ -92,23 +111,23 @@ def test_directions_of_a_panorama():
 
 
 @pytest.mark.parametrize("direction", [[0.2, 0.1, 1], [0.01, 0.2, -1], [0.3, -3, 0.1], [1, 2, -1]])
-def test_a_dot_is_drawn_where_its_direction_is(direction):
+def test_a_dot_is_drawn_where_its_direction_is(device, direction):
     camera = EquirectangularCamera(np.eye(4), 128)
     point = 3 * _unit(np.array(direction))
-    image = v3dg.render(dot(point, size=0.1), camera, depth=True)
+    image = drawn_on(device, dot(point, size=0.1), camera, depth=True)
     row, column = np.unravel_index(image.alpha.argmax(), image.alpha.shape)
     ray = camera.directions([[column + 0.5, row + 0.5]])[0]
     assert ray @ point / 3 > math.cos(2 * math.pi / 128)
     np.testing.assert_allclose(image.depth[row, column], 3, rtol=1e-3)
 
 
-def test_a_panorama_has_no_seam():
+def test_a_panorama_has_no_seam(device):
     """If the camera makes half a turn, the picture moves by half of its width across
     the border."""
     rng = np.random.default_rng(5)
     gaussians = around(rng, 100, 0.15)
-    first = v3dg.render(gaussians, EquirectangularCamera(np.eye(4), 64))
-    turned = v3dg.render(gaussians, EquirectangularCamera(np.diag([-1.0, 1, -1, 1]), 64))
+    first = drawn_on(device, gaussians, EquirectangularCamera(np.eye(4), 64))
+    turned = drawn_on(device, gaussians, EquirectangularCamera(np.diag([-1.0, 1, -1, 1]), 64))
     difference = np.abs(np.roll(turned.color, 32, axis=1) - first.color)
     assert np.quantile(difference, 0.99) < 1e-5
     assert np.abs(first.alpha[:, :1] - first.alpha[:, -1:]).max() < 0.3
@@ -136,14 +155,14 @@ def selected(scene, sensor_spacing, eye, tolerance):
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 3.0, 400.0])
-def test_no_cluster_that_a_scan_sees_is_left_out(tolerance):
+def test_no_cluster_that_a_scan_sees_is_left_out(device, tolerance):
     """The rays in float64 pass through all selected gaussians, without any culling."""
     rng = np.random.default_rng(7)
     scene = random_scene(rng, lod_bundle(rng, blob(rng, 200, sh_degree=1), 16), 6, spread=3)
     eye = rng.normal(size=3)
     pose = pose_of(rng, eye)
     lidar = Lidar(FULL_TURN[::2], np.linspace(-1.3, 1.3, 12), near=0.02)
-    scanned = v3dg.scan(scene, lidar, pose, tolerance=tolerance)
+    scanned = scanned_on(device, scene, lidar, pose, tolerance=tolerance)
     gaussians, filters, antialiased = selected(scene, lidar.spacing, eye, tolerance)
     assert scanned.gaussians == len(gaussians)
     directions = lidar.directions.reshape(-1, 3) @ pose[:3, :3].T
@@ -167,15 +186,15 @@ def test_no_cluster_that_a_scan_sees_is_left_out(tolerance):
     assert np.isclose(light, layers[:, :, 2], atol=1e-3).mean() > 0.99
 
 
-def test_a_ray_does_not_depend_on_the_other_rays():
+def test_a_ray_does_not_depend_on_the_other_rays(device):
     """Neither the tiles nor the boxes of directions change a result."""
     rng = np.random.default_rng(8)
     scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 10, spread=3)
     pose = pose_of(rng, [0.3, 0.2, -0.1])
-    whole = v3dg.scan(scene, LIDAR, pose)
+    whole = scanned_on(device, scene, LIDAR, pose)
     for rows, columns in ((slice(3, 5), slice(None)), (slice(None), slice(61, 64)), ([7], [20])):
         part = replace(LIDAR, azimuth=LIDAR.azimuth[columns], elevation=LIDAR.elevation[rows])
-        scanned = v3dg.scan(scene, part, pose)
+        scanned = scanned_on(device, scene, part, pose)
         for name in ("range", "intensity", "second_range", "second_intensity", "alpha"):
             expected = getattr(whole, name)[rows][:, columns]
             np.testing.assert_array_equal(getattr(scanned, name), expected, err_msg=name)
@@ -187,7 +206,7 @@ from scenes_lod import blob, lod_bundle, random_scene
 rng = np.random.default_rng(9)
 scene = random_scene(rng, lod_bundle(rng, blob(rng, 400), 16), 12, spread=3)
 lidar = v3dg.Lidar(np.linspace(0, 6, 50), np.linspace(-1, 1, 20))
-scan = v3dg.scan(scene, lidar, np.eye(4))
+scan = v3dg.scan(scene, lidar, np.eye(4), device="cpu")
 sys.stdout.buffer.write(scan.range.tobytes() + scan.alpha.tobytes())
 """
 
@@ -207,13 +226,15 @@ def test_scans_do_not_depend_on_threads():
     assert outputs[0] == outputs[1]
 
 
-def test_tables_may_have_any_order():
+def test_tables_may_have_any_order(device):
     rng = np.random.default_rng(10)
     gaussians = blob(rng, 300, size=3)
     azimuth = rng.permutation(FULL_TURN) - 2 * math.pi
     elevation = rng.permutation(LIDAR.elevation)
-    mixed = v3dg.scan(gaussians, replace(LIDAR, azimuth=azimuth, elevation=elevation), np.eye(4))
-    plain = v3dg.scan(gaussians, LIDAR, np.eye(4))
+    mixed = scanned_on(
+        device, gaussians, replace(LIDAR, azimuth=azimuth, elevation=elevation), np.eye(4)
+    )
+    plain = scanned_on(device, gaussians, LIDAR, np.eye(4))
     rows = np.searchsorted(LIDAR.elevation, elevation)
     columns = np.rint((azimuth + 2 * math.pi) / FULL_TURN[1]).astype(int)
     np.testing.assert_allclose(mixed.range, plain.range[rows][:, columns], rtol=1e-5)
@@ -225,13 +246,13 @@ def lidar_at(azimuths, **changes):
     return Lidar(np.array(azimuths), np.zeros(1), spacing=1e-3, **changes)
 
 
-def test_returns_are_layers_of_light():
+def test_returns_are_layers_of_light(device):
     leaf = dot((5, 0, 0), opacity=0.4, gray=0.5)
     branch = dot((5.2, 0, 0), opacity=0.5, gray=0.5)
     wall = dot((9, 0, 0), opacity=0.9, gray=1.0)
     dust = dot((2, 0, 0), opacity=0.05, gray=1.0)
     scene = v3dg.join([dust, leaf, branch, wall])
-    scanned = v3dg.scan(scene, lidar_at([0.0], gap=0.5, detection=0.1), np.eye(4))
+    scanned = scanned_on(device, scene, lidar_at([0.0], gap=0.5, detection=0.1), np.eye(4))
     # The dust is below the detection, so that it counts towards the next layer.
     weights = 0.05, 0.95 * 0.4, 0.95 * 0.6 * 0.5, 0.95 * 0.6 * 0.5 * 0.9
     np.testing.assert_allclose(scanned.range, 5, rtol=1e-5)
@@ -241,25 +262,25 @@ def test_returns_are_layers_of_light():
     np.testing.assert_allclose(scanned.second_range, 9, rtol=1e-5)
     np.testing.assert_allclose(scanned.second_intensity, weights[3], rtol=1e-4)
     np.testing.assert_allclose(scanned.alpha, sum(weights), rtol=1e-4)
-    split = v3dg.scan(scene, lidar_at([0.0], gap=0.1, detection=0.01), np.eye(4))
+    split = scanned_on(device, scene, lidar_at([0.0], gap=0.1, detection=0.01), np.eye(4))
     np.testing.assert_allclose([split.range[0, 0], split.second_range[0, 0]], [2, 5], rtol=1e-5)
 
 
-def test_points_are_in_the_world():
+def test_points_are_in_the_world(device):
     rng = np.random.default_rng(11)
     pose = pose_of(rng, [3, -2, 1])
     lidar = lidar_at([0.0, 1.0, 2.5])
     places = lidar.directions[0] * np.array([[4.0], [6], [5]])
     world = places @ pose[:3, :3].T + pose[:3, 3]
     scene = v3dg.join([dot(point, size=0.05) for point in world[:2]])
-    scanned = v3dg.scan(scene, lidar, pose)
-    np.testing.assert_allclose(scanned.points(), world[:2], atol=1e-4)
-    assert np.isinf(scanned.range[0, 2])
+    scanned = v3dg.scan(scene, lidar, pose, device=device)
+    np.testing.assert_allclose(host(scanned.points()), world[:2], atol=1e-4)
+    assert np.isinf(host(scanned.range)[0, 2])
     assert scanned.second_points().shape == (0, 3)
-    assert scanned.intensity[0, 2] == 0
+    assert host(scanned.intensity)[0, 2] == 0
 
 
-def test_only_places_between_near_and_far_are_hit():
+def test_only_places_between_near_and_far_are_hit(device):
     dots = v3dg.join([dot((x, 0, 0), size=0.001 * x) for x in (1.0, 2.0, 4.0)])
     ranges = {
         (0.1, math.inf): 1,
@@ -268,43 +289,92 @@ def test_only_places_between_near_and_far_are_hit():
         (2.5, 3.0): math.inf,
     }
     for (near, far), expected in ranges.items():
-        scanned = v3dg.scan(dots, lidar_at([0.0], near=near, far=far), np.eye(4))
+        scanned = scanned_on(device, dots, lidar_at([0.0], near=near, far=far), np.eye(4))
         np.testing.assert_allclose(scanned.range, expected, rtol=1e-5)
 
 
-def test_an_eye_inside_a_gaussian_sees_it_in_front_only():
+def test_an_eye_inside_a_gaussian_sees_it_in_front_only(device):
     cloud = dot((0.5, 0, 0), size=1.0)
-    scanned = v3dg.scan(cloud, lidar_at([0.0, math.pi]), np.eye(4))
+    scanned = scanned_on(device, cloud, lidar_at([0.0, math.pi]), np.eye(4))
     np.testing.assert_allclose(scanned.range[0, 0], 0.5, rtol=1e-4)
     assert np.isinf(scanned.range[0, 1])
 
 
 @pytest.mark.parametrize("broken", ["means", "quats", "scales", "opacities"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_gaussians_that_are_not_finite_are_not_hit(broken, value):
+def test_gaussians_that_are_not_finite_are_not_hit(device, broken, value):
     gaussians = dot((3, 0, 0), size=0.1)
     getattr(gaussians, broken)[:] = value
-    scanned = v3dg.scan(gaussians, lidar_at([0.0, 1.0, 4.0]), np.eye(4))
+    scanned = scanned_on(device, gaussians, lidar_at([0.0, 1.0, 4.0]), np.eye(4))
     assert (scanned.alpha == 0).all()
 
 
-def test_factors_of_instances_and_weights_count():
+def test_factors_of_instances_and_weights_count(device):
     rng = np.random.default_rng(12)
     bundle = lod_bundle(rng, blob(rng, 200), 16)
     scene = Scene()
     scene.add(bundle, positions=[[4.0, 0, 0]])
-    plain = v3dg.scan(scene, LIDAR, np.eye(4))
+    plain = scanned_on(device, scene, LIDAR, np.eye(4))
     scene.set_opacity(0.25)
-    faint = v3dg.scan(scene, LIDAR, np.eye(4))
+    faint = scanned_on(device, scene, LIDAR, np.eye(4))
     assert 0 < faint.alpha.max() < plain.alpha.max()
 
 
-def test_several_poses_are_several_scans():
-    gaussians = dot((3, 0, 0), size=0.1)
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, 0, 3] = 1
-    first, second = v3dg.scan(gaussians, lidar_at([0.0]), poses)
-    np.testing.assert_allclose([first.range[0, 0], second.range[0, 0]], [3, 2], rtol=1e-5)
+def test_several_poses_are_several_scans(device):
+    rng = np.random.default_rng(13)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 10, spread=3)
+    poses = np.stack([pose_of(rng, rng.normal(size=3)) for _ in range(5)])
+    batch = v3dg.scan(scene, LIDAR, poses, device=device)
+    assert len(batch) == len(batch.gaussians) == 5
+    assert batch.alpha.max() > 0.5
+    for pose, of_batch in zip(poses, batch, strict=True):
+        alone = v3dg.scan(scene, LIDAR, pose, device=device)
+        assert of_batch.gaussians == alone.gaussians
+        np.testing.assert_array_equal(of_batch.pose, pose)
+        for name in PLANES:
+            expected = host(getattr(alone, name))
+            np.testing.assert_array_equal(host(getattr(of_batch, name)), expected, err_msg=name)
+    assert [scan.gaussians for scan in batch[1:3]] == batch.gaussians[1:3]
+    with pytest.raises(IndexError, match=r"^number: expected one of 5 scans, got 5"):
+        batch[5]
+
+
+def test_many_hits_at_one_place_are_blended_in_order(device):
+    """More gaussians than a window holds reach from the eye to beyond the wall, so that
+    nothing is certain to be in front of anything."""
+    rng = np.random.default_rng(14)
+    count = 600
+    axis = np.array([1.0, 0.3, 0.1]) / math.sqrt(1.1)
+    distances = np.append(rng.uniform(2, 6, count - 1), 4.0)
+    gaussians = Gaussians(
+        means=np.float32(distances[:, None] * axis),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=np.tile(np.float32([3, 0.4, 0.4]), (count, 1)),
+        opacities=np.full(count, 0.02, np.float32),
+        sh=rng.uniform(-1, 1, (count, 1, 3)).astype(np.float32),
+    )
+    lidar = Lidar(np.linspace(-0.5, 1.0, 40), np.linspace(-0.5, 0.7, 20), near=0.01)
+    scanned = scanned_on(device, gaussians, lidar, np.eye(4))
+    exact = reference_rays.cast(
+        gaussians, np.zeros(3), lidar.directions.reshape(-1, 3), near=lidar.near
+    )
+    assert max(len(ray) for ray in exact.contributions) > 300
+    assert_like(scanned.alpha, exact.alpha, exact.cutoff_distance, 2e-4)
+    layers = np.array(
+        [reference_rays.returns(ray, lidar.detection, lidar.gap) for ray in exact.contributions]
+    )
+    ranges = np.stack([scanned.range.ravel(), scanned.second_range.ravel()], axis=1)
+    assert np.isclose(ranges, layers[:, :, 0], rtol=1e-3).mean() > 0.95
+    light = np.stack([scanned.intensity.ravel(), scanned.second_intensity.ravel()], axis=1)
+    assert np.isclose(light, layers[:, :, 2], atol=2e-3).mean() > 0.95
+
+
+def test_opaque_rays_end_behind_a_small_share_of_the_light(device):
+    wall = v3dg.join([dot((x, 0, 0), opacity=0.999, size=0.3) for x in (2.0, 3.0, 4.0)])
+    scanned = scanned_on(device, wall, lidar_at([0.0]), np.eye(4))
+    np.testing.assert_allclose(scanned.alpha, 1 - 1e-6, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(scanned.range, 2, rtol=1e-5)
+    assert np.isinf(scanned.second_range).all()
 
 
 ERRORS = {
@@ -348,9 +418,78 @@ def test_wrong_values_are_one_clear_error(message):
 
 
 @pytest.mark.gpu
-def test_rays_on_a_cuda_device_are_refused():
-    camera = EquirectangularCamera(np.eye(4), 32)
-    with pytest.raises(ValueError, match=r"^device: expected 'cpu' or 'auto'"):
-        v3dg.render(dot((1, 0, 0)), camera, device="cuda")
-    with pytest.raises(ValueError, match=r"^device: expected 'cpu' or 'auto'"):
-        v3dg.scan(dot((1, 0, 0)), LIDAR, np.eye(4), device="cuda")
+def test_scans_of_both_devices_agree():
+    rng = np.random.default_rng(15)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 400, sh_degree=2), 16), 40, spread=4)
+    scene.set_opacity(0.7)
+    lidar = Lidar(np.linspace(0, 6.2, 300), np.linspace(-0.6, 0.6, 40))
+    for pose in (pose_of(rng, [0.1, 0, 0.2]), pose_of(rng, [3, 1, 0])):
+        on_cpu = scanned_on("cpu", scene, lidar, pose)
+        on_cuda = scanned_on("cuda", scene, lidar, pose)
+        assert on_cpu.gaussians == on_cuda.gaussians
+        for name in PLANES:
+            ours, expected = getattr(on_cuda, name), getattr(on_cpu, name)
+            assert np.isclose(ours, expected, rtol=1e-4, atol=1e-4).mean() > 0.998, name
+
+
+@pytest.mark.gpu
+def test_panoramas_of_both_devices_agree():
+    rng = np.random.default_rng(16)
+    bundle = lod_bundle(rng, blob(rng, 400, sh_degree=1), 16)
+    scene = random_scene(rng, bundle, 20, spread=3)
+    camera = EquirectangularCamera(np.eye(4), 256)
+    options = {"background": (0.2, 0.3, 0.4), "fade": 1.5, "depth": True}
+    on_cpu = drawn_on("cpu", scene, camera, **options)
+    on_cuda = drawn_on("cuda", scene, camera, **options)
+    for name, bound in (("color", 1e-4), ("alpha", 1e-4), ("depth", 1e-3)):
+        difference = np.abs(getattr(on_cuda, name) - getattr(on_cpu, name))
+        assert np.quantile(difference, 0.998) < bound, name
+
+
+@pytest.mark.gpu
+def test_poses_on_the_device_are_read_there():
+    import torch
+
+    rng = np.random.default_rng(17)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 10, spread=3)
+    poses = np.stack([pose_of(rng, rng.normal(size=3)) for _ in range(3)])
+    expected = v3dg.scan(scene, LIDAR, poses, device="cuda")
+    tensor = torch.tensor(poses, device="cuda")
+    made = v3dg.scan(scene, LIDAR, tensor, device="cuda")
+    assert made.range.is_cuda
+    np.testing.assert_array_equal(host(made.range), host(expected.range))
+    np.testing.assert_allclose(host(made[1].points()), host(expected[1].points()), atol=1e-9)
+    tensor[1, 0, 0] = math.nan
+    broken = v3dg.scan(scene, LIDAR, tensor, device="cuda")
+    assert host(broken.alpha)[1].max() == 0
+    assert np.isinf(host(broken.range)[1]).all()
+    np.testing.assert_array_equal(host(broken.range)[[0, 2]], host(expected.range)[[0, 2]])
+    single = v3dg.scan(scene, LIDAR, tensor[0].float(), device="cuda")
+    assert np.isclose(host(single.alpha), host(expected.alpha)[0], atol=1e-3).mean() > 0.99
+    with pytest.raises(ValueError, match=r"^pose: expected a tensor on cpu"):
+        v3dg.scan(scene, LIDAR, tensor, device="cpu")
+
+
+@pytest.mark.gpu
+def test_scans_have_the_same_bits_in_every_run():
+    rng = np.random.default_rng(18)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 500), 32), 60, spread=4)
+    first, *others = (scanned_on("cuda", scene, LIDAR, np.eye(4)) for _ in range(4))
+    for other in others:
+        for name in PLANES:
+            np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
+
+
+@pytest.mark.gpu
+def test_scans_follow_a_scene_that_moves_and_grows():
+    rng = np.random.default_rng(19)
+    bundle = lod_bundle(rng, blob(rng, 300), 16)
+    scene = Scene()
+    ids = scene.add(bundle, positions=[[4.0, 0, 0], [0, 5.0, 0]])
+    before = scanned_on("cuda", scene, LIDAR, np.eye(4))
+    scene.move(ids, positions=[[6.0, 0, 0], [0, 5.0, 0]])
+    scene.add(lod_bundle(rng, blob(rng, 200), 16), positions=[[-4.0, 0, 0]])
+    after = scanned_on("cuda", scene, LIDAR, np.eye(4))
+    on_cpu = scanned_on("cpu", scene, LIDAR, np.eye(4))
+    assert np.isclose(after.alpha, on_cpu.alpha, atol=1e-4).mean() > 0.998
+    assert not np.isclose(after.alpha, before.alpha, atol=1e-2).all()

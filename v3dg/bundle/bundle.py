@@ -191,7 +191,7 @@ class Bundle:
             for pages in runs_of_pages(0, self.num_pages, page_bytes, _RUN_BYTES):
                 gaussians = self._pages.read(pages.start, pages.stop)
                 run = plan.run(pages.start, pages.stop)
-                hashes.append(write_pages(file.fileno(), run, self._codec, gaussians))
+                hashes.append(write_pages(temporary, file.fileno(), run, self._codec, gaussians))
             plan.write_tables(file.fileno(), self.clusters, self.groups, np.concatenate(hashes))
             plan.write_header(file.fileno())
 

@@ -1,10 +1,9 @@
 """Codecs, which define how the gaussians of a page are stored as bytes.
 
-Pages are encoded here. The core decodes them, with one `PageCodec` for each codec
+The core encodes and decodes pages, with one `PageCodec` for each codec
 (csrc/residency/page_source.h). docs/extending.md describes how to add a codec.
 """
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -44,13 +43,6 @@ class Codec:
         num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
         return (num_bytes + self.alignment - 1) & -self.alignment  # the alignment is a power of two
 
-    def encode(
-        self, gaussians: Gaussians, offset: NDArray[np.int64]
-    ) -> Sequence[NDArray[np.generic]]:
-        """Return the bytes of a page as arrays to be concatenated. `offset` has the
-        first row of each of its clusters, and the end."""
-        return [array[offset[0] : offset[-1]] for array in vars(gaussians).values()]
-
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
         """Return the gaussians after encoding and decoding, on their device. `offset`
         has the first row of each cluster, and the end."""
@@ -70,11 +62,6 @@ class Quantized(Codec):
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree
         self.gaussian_bytes, self.cluster_bytes, self.alignment = _core.page_code_bytes(sh_degree)
-
-    def encode(
-        self, gaussians: Gaussians, offset: NDArray[np.int64]
-    ) -> Sequence[NDArray[np.generic]]:
-        return [_core.encode_page(gaussians.rows, offset)]
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
         result = self.empty(len(gaussians))

@@ -22,15 +22,13 @@ from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
 from v3dg.bundle.format import (
     DTYPES,
-    HASH_BYTES,
     VERSION,
     Entry,
     entries_of,
-    page_hash,
     page_tables,
     schema_of,
 )
-from v3dg.bundle.pages import PageLayout, PageRun, on_threads
+from v3dg.bundle.pages import PageLayout, PageRun
 from v3dg.bundle.tables import Clusters, Column, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
@@ -90,22 +88,16 @@ class BundlePlan:
 
 
 def write_pages(
-    descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians
+    path: str | os.PathLike[str],
+    descriptor: int,
+    run: PageRun,
+    codec: Codec,
+    gaussians: Gaussians,
 ) -> NDArray[np.uint8]:
     """Write the gaussians of neighbouring pages, which may be on any device, at their
     positions in the file. Return (n, 16) the hashes of the pages."""
-    host = gaussians.numpy()
-    sizes = np.diff(run.places)
-    hashes = np.empty((len(run), HASH_BYTES), np.uint8)
-
-    def write(page: int) -> None:
-        data = b"".join(piece.tobytes() for piece in codec.encode(host, run.clusters_of(page)))
-        data = data.ljust(int(sizes[page]), b"\0")
-        hashes[page] = np.frombuffer(page_hash([np.frombuffer(data, np.uint8)]), np.uint8)
-        _files.write_at(descriptor, data, int(run.places[page]))
-
-    on_threads(write, range(len(run)))
-    return hashes
+    rows = gaussians.numpy().rows
+    return _core.write_pages(os.fspath(path), descriptor, rows, codec.name, run.core)
 
 
 def read_pages(

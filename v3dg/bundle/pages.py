@@ -111,12 +111,6 @@ class PageRun:
         """The rows of all gaussians in the bundle."""
         return slice(int(self.offset[0]), int(self.offset[-1]))
 
-    def clusters_of(self, number: int) -> NDArray[np.int64]:
-        """Return the boundaries of the gaussians of one page's clusters, relative to
-        the first gaussian of the run. `number` is the index of the page in the run."""
-        first, last = self.first_cluster[number : number + 2].tolist()
-        return np.asarray(self.offset[first : last + 1] - self.offset[0])
-
 
 class MemoryPages:
     """The pages of a bundle whose float32 gaussians are all in memory."""
@@ -149,7 +143,7 @@ class CodePages:
         words = np.empty(int(places[-1]), np.int32)
 
         def encode(page: int) -> None:
-            (encoded,) = codec.encode(gaussians, layout.clusters_of(page))
+            encoded = _core.encode_page(gaussians.rows, layout.clusters_of(page))
             words[places[page] : places[page + 1]] = encoded
 
         on_threads(encode, range(layout.num_pages))

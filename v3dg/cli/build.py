@@ -63,9 +63,9 @@ class Build(_common.OnDevice):
     quality: Annotated[Quality | None, _common.option("{draft,standard,best}")] = None
     """How similar the levels are to the asset. `draft` keeps the levels as they are
     built. `standard` also refines them together, which takes 2 s more for 45,000
-    gaussians and 5 s for 500,000 on an H100, and minutes on a CPU. `best` uses five
-    times as many pictures for that. The default is `standard` on a GPU, for up to 4
-    million gaussians, and `draft` otherwise."""
+    gaussians, 5 s for 500,000 and 12 s for 2 million on an H100, in proportion for
+    more, and minutes on a CPU. `best` uses five times as many pictures for that. The
+    default is `standard` on a GPU, and `draft` otherwise."""
     seen_from: Annotated[SeenFrom, _common.option("{auto,outside,inside,both}")] = "auto"
     """From where pictures of a refinement are taken; by default, the free space that
     the asset surrounds decides. With photographs, `v3dg refine --cameras` is better."""

@@ -24,7 +24,7 @@ from v3dg.scene import Scene
 @dataclass
 class Export(_common.Common):
     """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD
-    (docs/formats.md).
+    (docs/formats.md, docs/web_page.md).
 
     The folder may be new, empty, or contain an earlier export. Only unchanged files
     that are listed in its v3dg-export.json are replaced or removed. The inputs must not
@@ -36,8 +36,9 @@ class Export(_common.Common):
     output: Annotated[Path | None, _common.option("FOLDER", "-o")] = None
     """Folder to write, which is created if needed; by default the name of the subject
     followed by _web. A name that ends in .usd, .usda or .usdc is a file."""
-    to: Literal["sog", "tiles"] = "sog"
-    """Streamed SOG for PlayCanvas and SuperSplat, or 3D Tiles for CesiumJS."""
+    to: Literal["sog", "tiles", "v3dg"] = "sog"
+    """Streamed SOG for PlayCanvas and SuperSplat, 3D Tiles for CesiumJS, or bundles for
+    our own page, which needs a browser with WebGPU."""
     chunk: int = export.DEFAULT_CHUNK
     """Largest number of gaussians of an asset in a chunk of streamed SOG. Viewers
     choose a level for each chunk."""
@@ -78,6 +79,8 @@ def run(options: Export) -> None:
         return
     if options.to == "tiles":
         written = _write_tiles(options, subject, folder, up)
+    elif options.to == "v3dg":
+        written = _write_web_page(options, subject, folder, up, cameras)
     else:
         written = _write_site(options, subject, folder, up, cameras)
     seconds = time.perf_counter() - start
@@ -90,7 +93,7 @@ def run(options: Export) -> None:
 class _Written:
     """A finished export to a folder."""
 
-    export: export.Site | export.Tiles
+    export: export.Site | export.Tiles | export.WebPage
     text: str  # a description of the content
     needs: Sequence[str]  # commands that install a missing engine in the folder
 
@@ -103,6 +106,24 @@ def _write_tiles(options: Export, subject: Scene | Bundle, folder: Path, up: Axi
     if not (folder / export.CESIUM).exists():
         needs = export.TILES_NEED
     return _Written(tiles, f"{tiles.tiles:,} tiles", needs)
+
+
+def _write_web_page(
+    options: Export,
+    subject: Scene | Bundle,
+    folder: Path,
+    up: Axis,
+    cameras: Mapping[str, Camera] | None,
+) -> _Written:
+    page = export.write_web_page(
+        subject,
+        folder,
+        cameras,
+        up=up,
+        progress=not options.quiet,
+        overwrite=options.overwrite,
+    )
+    return _Written(page, f"{page.gaussians:,} gaussians", ())
 
 
 def _write_site(

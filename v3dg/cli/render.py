@@ -35,9 +35,11 @@ from v3dg.image import Image, RenderedImage
 from v3dg.io import subject_name
 from v3dg.panorama import draw_panorama
 from v3dg.pictures import check_picture_path, check_size
-from v3dg.render import Renderer
+from v3dg.render import Renderer, render
+from v3dg.render.rays import RayImage
 from v3dg.scene import Subject
 from v3dg.select import DEFAULT_FADE, CutOptions
+from v3dg.spherical import EquirectangularCamera
 from v3dg.upright import direction_of
 from v3dg.video import write_video
 
@@ -72,7 +74,10 @@ class Render(Cut, OnPool):
     or none for a transparent .png (straight alpha)."""
     projection: Literal["pinhole", "equirectangular"] = "pinhole"
     """Draw the view of the camera, or all directions around it. For all directions, the
-    width in --size must be twice the height."""
+    width in --size must be twice the height. Gaussians are then evaluated on the ray of
+    each pixel, which needs all of them in memory. With --budget, with another
+    --color-by or with a pool, the picture is combined from 26 pinholes, which is less
+    exact."""
     fps: Annotated[int, tyro.conf.arg(metavar="N")] = 30
     """Pictures per second of a film."""
     seconds: Annotated[float | None, option("S")] = None
@@ -134,7 +139,16 @@ def run(options: Render) -> None:
         _write_pictures(
             picture_paths(output, cameras), drawn, pictures, is_transparent=background is None
         )
+    if options.is_panorama and not _casts_rays(options, renderer):
+        notes.append("panorama: combined from 26 pinholes; rays are more exact (see --projection)")
     _print(options, pictures, notes, output)
+
+
+def _casts_rays(options: Render, renderer: Renderer) -> bool:
+    """Return whether panoramas are drawn with rays, which have neither budgets nor
+    false colours, and need all gaussians in memory."""
+    is_plain = options.budget is None and options.color_by == "appearance"
+    return options.is_panorama and is_plain and renderer.memory is None
 
 
 def _print(options: Render, pictures: list[JsonObject], notes: list[str], output: Path) -> None:
@@ -142,10 +156,13 @@ def _print(options: Render, pictures: list[JsonObject], notes: list[str], output
         Column("picture", "{picture}"),
         Column("size", "{width} x {height}"),
         Column("selected", "{gaussians_selected:,}"),
-        Column("in frustum", "{gaussians_in_frustum:,}"),
-        Column("select ms", "{select_ms:.1f}"),
-        Column("draw ms", "{draw_ms:.1f}"),
     ]
+    if "draw_ms" in pictures[0]:
+        columns += [
+            Column("in frustum", "{gaussians_in_frustum:,}"),
+            Column("select ms", "{select_ms:.1f}"),
+            Column("draw ms", "{draw_ms:.1f}"),
+        ]
     result: JsonObject = {"subject": shown(options.subject), "pictures": pictures}
     lines = table_lines(columns, pictures)
     if options.is_film:
@@ -256,22 +273,32 @@ def _drawn(
         faces.append(image)
         return image
 
+    casts_rays = _casts_rays(options, renderer)
+    direction = direction_of(style.up)
+    panorama_width = options.view.size[0]
     for name, camera in counted(cameras.items(), len(cameras), "render", show):
         faces.clear()
         image: Image
-        if options.is_panorama:
-            image = draw_panorama(draw, camera, direction_of(style.up), options.view.size[0])
+        if casts_rays:
+            sphere = EquirectangularCamera.level(camera, direction, panorama_width)
+            image = render(
+                renderer.subject, sphere, **cut, background=background, device=options.device
+            )
+        elif options.is_panorama:
+            image = draw_panorama(draw, camera, direction, panorama_width)
         else:
             image = draw(camera)
         height, width = image.alpha.shape
         picture: JsonObject = {"camera": name, "width": width, "height": height}
-        pictures.append({**picture, **_costs(faces)})
+        pictures.append({**picture, **_costs(image, faces)})
         yield image
 
 
-def _costs(faces: list[RenderedImage]) -> JsonObject:
-    """Return the costs of a picture. For a panorama, they are the sums over its
-    sides."""
+def _costs(image: Image, faces: list[RenderedImage]) -> JsonObject:
+    """Return the costs of a picture. For a panorama of pinholes, they are the sums over
+    its sides."""
+    if isinstance(image, RayImage):
+        return {"gaussians_selected": image.gaussians}
     stats = [face.stats for face in faces]
     costs: JsonObject = stats[0]._asdict()
     for name in ("gaussians_selected", "gaussians_in_frustum", "select_ms", "draw_ms"):

@@ -29,7 +29,8 @@ _PIECE_BYTES = 1 << 20
 _HASH_BYTES = 16
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9_]{1,100}(/[A-Za-z0-9_]{1,100})?")
 _FILE_NAME = re.compile(
-    r"([A-Za-z0-9_]{1,100}/){0,2}[A-Za-z0-9_][A-Za-z0-9_-]{0,99}(\.[a-z]{1,20}){0,2}\.(html|json|mjs|webp|glb)"
+    r"([A-Za-z0-9_]{1,100}/){0,2}[A-Za-z0-9_][A-Za-z0-9_-]{0,99}(\.[a-z]{1,20}){0,2}\."
+    r"(html|json|mjs|webp|glb|v3dg|js|ts|css|wgsl|wasm)"
 )
 _HASH = re.compile(f"[0-9a-f]{{{2 * _HASH_BYTES}}}")
 

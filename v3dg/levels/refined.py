@@ -141,11 +141,14 @@ class RefineSteps:
         rate: Step sizes, as fractions of those of a fit, of a gaussian that appears in
             one of the windows. They grow with the square root of the number of windows
             that show the gaussian.
+        window_means: Weight of the difference between the means of a window and of the
+            asset there, relative to the differences of pixels.
     """
 
     windows: int
     cuts_per_view: int = 8
     rate: float = _RATE
+    window_means: float = 1.0
 
 
 def default_steps(device: Device) -> RefineSteps:
@@ -215,6 +218,7 @@ class Cuts:
         comparison = _core.CutComparison(
             windows_per_step=settings.windows,
             cuts_per_view=settings.cuts_per_view,
+            window_means=settings.window_means,
         )
         num_steps = -(-num_pictures // settings.windows)
         move = partial(

@@ -77,7 +77,10 @@ class PageFile:
         """Write the gaussians of a run of pages, on any device; return (n, 16) their
         hashes."""
         with self._opened(os.O_RDWR) as descriptor:
-            return write_pages(descriptor, run, self.codec, gaussians)
+            hashes = write_pages(self.path, descriptor, run, self.codec, gaussians)
+            first, last = run.places[[0, -1]].tolist()
+            _files.start_flush(descriptor, first, last - first)
+            return hashes
 
     def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:
         """Return the gaussians of a run of pages that have these hashes."""

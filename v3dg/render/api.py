@@ -14,17 +14,17 @@ from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_cam
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
-from v3dg.image import Image, RenderedImage
+from v3dg.image import RenderedImage
 from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
-from v3dg.render.rays import check_rays, draw_sphere
+from v3dg.render.rays import RayImage, check_rays, draw_rays
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, mesh_device, sensor_of
+from v3dg.render.sensor import Channel, MeshLayer, sensor_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
@@ -65,7 +65,7 @@ def render(
 @overload
 def render(
     subject: Subject | File, camera: EquirectangularCamera, **options: Unpack[_Options]
-) -> Image: ...
+) -> RayImage: ...
 @overload
 def render(
     subject: Subject | File, camera: Sequence[Camera], **options: Unpack[_Options]
@@ -87,7 +87,7 @@ def render(
     mesh: MeshLayer | None = None,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
-) -> Image | _Pictures:
+) -> RayImage | _Pictures:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
@@ -106,10 +106,10 @@ def render(
             The two eyes of a stereo camera share one cut and one frame. Their two
             pictures have common statistics, which are sums, except for the number of
             selected gaussians. None means the first camera of a scene's file, else the
-            camera of `first_camera`. An `EquirectangularCamera` is drawn on the CPU
-            with all gaussians resident, without statistics, and takes none
-            of `budget`, `cut`, `min_transmittance`, `mesh`, channels other than
-            "depth", and a number of bytes as `memory`.
+            camera of `first_camera`. An `EquirectangularCamera` is drawn with all
+            gaussians resident, without statistics, and takes none of `budget`, `cut`,
+            `min_transmittance`, `mesh`, channels other than "depth", and a number of
+            bytes as `memory`.
         tolerance, budget, min_level: As in `v3dg.select`.
         fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
@@ -129,12 +129,11 @@ def render(
         depth: Whether to draw the expected depth, too.
         channels: Names of channels that are drawn beside colour and alpha, and become
             attributes of the picture: "depth" (as `depth=True`), "median_depth",
-            "normal", "instance", "label", "weight", "clipped" (docs/sensors.md). On
-            CUDA devices, only "depth" is supported for scenes and bundles, and all but
-            "clipped" for assets. "clipped" needs a pinhole.
+            "normal", "instance", "label", "weight", "clipped" (docs/sensors.md).
+            "clipped" is drawn only on the CPU, and needs a pinhole.
         mesh: Picture of meshes of the same size, for one camera. Its pixels hide the
             gaussians behind them. Colour, alpha and channels include gaussians and
-            meshes. On CUDA devices, it is supported only for assets.
+            meshes.
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what
             the next picture of the same scene or bundle needs; a `Renderer` controls
@@ -150,13 +149,12 @@ def render(
     cut_request = CutRequest(tolerance, budget, min_level, fade)
     if isinstance(camera, EquirectangularCamera):
         with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=_device.CPU)
-        check_rays(color_by, cut, sensor, min_transmittance, device, memory)
-        return draw_sphere(opened_subject, camera, cut_request, background, depth=with_depth)
+        check_rays(color_by, cut, sensor, min_transmittance, memory)
+        return draw_rays(opened_subject, camera, cut_request, background, device, depth=with_depth)
     chosen_device = _device.resolve(device)
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
-    place = mesh_device(chosen_device, opened_subject)
-    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=place)
+    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=chosen_device)
     shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:

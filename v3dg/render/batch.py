@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class BatchPlanes:
-    """The memory of a batch's pictures: float32 and contiguous, NumPy arrays or torch
-    tensors on the device that draws.
+    """The memory of a batch's pictures: contiguous and float32 (ids int32), NumPy
+    arrays or torch tensors on the device that draws.
 
     Attributes:
         color: (B, H, W, 3) premultiplied colour with the background, or (B, H, W, 4)
@@ -36,17 +36,35 @@ class BatchPlanes:
         alpha: (B, H, W) coverage; None if it is not wanted, or is in `color`.
         depth: (B, H, W) expected depth along the camera's axis, 0 where nothing was
             drawn; None if it is not wanted.
+        median_depth, weight: (B, H, W) channels (docs/sensors.md), which are drawn if
+            there are planes for them; None if they are not wanted.
+        normal: (B, H, W, 3), likewise.
+        instance, label: (B, H, W) int32, likewise.
     """
 
     color: Array
     alpha: Array | None = None
     depth: Array | None = None
+    median_depth: Array | None = None
+    normal: Array | None = None
+    instance: Array | None = None
+    label: Array | None = None
+    weight: Array | None = None
 
     @cached_property
     def core(self) -> _core.BatchPlanes:
         """The planes for the compiled operations; ValueError if they do not fit
         together."""
-        return _core.BatchPlanes(self.color, self.alpha, self.depth)
+        return _core.BatchPlanes(
+            self.color,
+            self.alpha,
+            self.depth,
+            median_depth=self.median_depth,
+            normal=self.normal,
+            instance=self.instance,
+            label=self.label,
+            weight=self.weight,
+        )
 
 
 class BatchStats(NamedTuple):
@@ -85,7 +103,17 @@ class RenderedBatch(Sensed):
     def planes(self) -> BatchPlanes:
         """The arrays of the attributes without waiting, for work that is queued on the
         same stream."""
-        return BatchPlanes(self._core.color, self._core.alpha, self._core.depth)
+        channels = self._core.channels
+        return BatchPlanes(
+            self._core.color,
+            self._core.alpha,
+            self._core.depth,
+            median_depth=channels.median_depth,
+            normal=channels.normal,
+            instance=channels.instance,
+            label=channels.label,
+            weight=channels.weight,
+        )
 
     def wait(self) -> None:
         """Wait until all pictures are drawn. If the buffers of the renderer were too

@@ -1,4 +1,4 @@
-"""Rays of spherical sensors, cast through scenes, bundles and assets on the CPU."""
+"""Rays of spherical sensors, cast through scenes, bundles and assets."""
 
 from __future__ import annotations
 
@@ -7,31 +7,75 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from v3dg import _core, _device
-from v3dg._device import CPU, Device
 from v3dg._numbers import check
 from v3dg._numbers import color as color_of
 from v3dg.gaussians import TRAINED_FILTER_PX2, Gaussians
 from v3dg.image import Image
 from v3dg.render.asset_frame import check_request
-from v3dg.residency import residency
+from v3dg.residency import ResidentScene, residency
 from v3dg.spherical import MIN_TRANSMITTANCE, EquirectangularCamera
 
 if TYPE_CHECKING:
+    import weakref
     from collections.abc import Sequence
 
+    from v3dg._device import Device
+    from v3dg.bundle import Bundle
     from v3dg.false_color import ColorBy
+    from v3dg.gaussians import Array
     from v3dg.render.request import CutRequest
     from v3dg.scene import Subject
     from v3dg.select import Selection
 
 
-def check_rays_device(device: str | Device) -> None:
-    """Raise ValueError for a CUDA device: rays are cast on the CPU only."""
-    if device == "auto":
-        return
-    target = _device.resolve(device)
-    expected = f"'cpu' or 'auto', because rays are cast on the CPU only, got {str(target)!r}"
-    check("device", not target.is_cuda, expected)
+class RayImage(Image):
+    """A picture that was drawn with rays.
+
+    Attributes:
+        gaussians: Number of gaussians in the selected clusters.
+    """
+
+    def __init__(self, color: Array, alpha: Array, depth: Array | None, gaussians: int) -> None:
+        super().__init__(color, alpha, depth)
+        self.gaussians = gaussians
+
+
+class RayFrame:
+    """Casts rays through a scene or a bundle on one device, with buffers that are
+    reused from cast to cast. It does not keep the subject alive."""
+
+    def __init__(self, device: Device) -> None:
+        self._core = _core.RayFrame(device.number)
+        self._device = device
+        self._num_bundles = 0
+        self._references: tuple[weakref.ref[Bundle], ...] | None = None
+        self._resident: ResidentScene | None = None  # the scene of the last cast
+
+    def cast(
+        self,
+        subject: Subject,
+        sensor: _core.RaySensor,
+        viewmats: Array,
+        cut: CutRequest,
+        returns: tuple[float, float] | None,
+    ) -> _core.Cast:
+        """Cast the rays of a sensor at each of B poses; see `cast_rays`."""
+        with residency.turn(self._device):
+            resident = residency.scene(subject, self._device, self._resident)
+            self._resident = resident
+            self._take(resident)
+            return self._core.cast_scene(resident.core, sensor, viewmats, cut.rule, returns)
+
+    def _take(self, resident: ResidentScene) -> None:
+        """Put the gaussians of the scene's bundles on the device."""
+        if self._references is resident.references:
+            return
+        with residency.lock:
+            bundles = resident.bundles
+            if self._num_bundles < len(bundles):
+                self._core.set_models([residency.model(b, self._device) for b in bundles])
+                self._num_bundles = len(bundles)
+            self._references = resident.references
 
 
 def check_rays(
@@ -39,7 +83,6 @@ def check_rays(
     cut: Selection | None,
     sensor: _core.Sensor | None,
     min_transmittance: float | None,
-    device: str | Device,
     memory: int | str | None,
 ) -> None:
     """Raise ValueError for options of pictures that rays do not have."""
@@ -50,19 +93,22 @@ def check_rays(
     check("min_transmittance", min_transmittance is None, expected)
     expected = f"'auto' or None for rays, which need all gaussians in memory, got {memory!r}"
     check("memory", memory in ("auto", None), expected)
-    check_rays_device(device)
 
 
 def cast_rays(
     subject: Subject,
     sensor: _core.RaySensor,
+    viewmats: Array,
     cut: CutRequest,
+    device: Device,
     returns: tuple[float, float] | None = None,
 ) -> _core.Cast:
     """Cast the rays of a sensor through the cut of a scene or a bundle, or through all
-    of an asset.
+    of an asset, at each of B poses.
 
     Args:
+        viewmats: (B, 4, 4) world to sensor: doubles in host memory, or a tensor of
+            float32 or float64 on the device.
         returns: The least weight of a return, and the gap behind it; None for colour
             and range.
 
@@ -70,49 +116,63 @@ def cast_rays(
         ValueError: The cut has a budget, or an asset is drawn with a cut.
     """
     check("budget", cut.budget is None, "none for rays, got one; leave it out")
+    if device.is_cuda:
+        import torch
+
+        viewmats = torch.as_tensor(viewmats, device=str(device)).contiguous()
     if isinstance(subject, Gaussians):
-        return _cast_asset(subject, sensor, cut, returns)
-    with residency.turn(CPU):
-        resident = residency.scene(subject, CPU)
-        models = [residency.model(bundle, CPU) for bundle in resident.bundles]
-        return _core.cast_scene(resident.core, models, sensor, cut.rule, returns)
+        return _cast_asset(subject, sensor, viewmats, cut, device, returns)
+    frame = residency.once(subject, ("frame", "rays", device), lambda: RayFrame(device))
+    return frame.cast(subject, sensor, viewmats, cut, returns)
 
 
 def _cast_asset(
     asset: Gaussians,
     sensor: _core.RaySensor,
+    viewmats: Array,
     cut: CutRequest,
+    device: Device,
     returns: tuple[float, float] | None,
 ) -> _core.Cast:
     check_request(cut)
     filter_px2 = 0.0
     if asset.antialiased:
         filter_px2 = TRAINED_FILTER_PX2
-    model = _core.Model(_device.place(asset, CPU).rows)
-    antialiased = bool(asset.antialiased)
-    return _core.cast_model(
-        model, sensor, filter_px2=filter_px2, antialiased=antialiased, returns=returns
+    model = _core.Model(_device.place(asset, device).rows)
+    return _core.RayFrame(device.number).cast_model(
+        model,
+        sensor,
+        viewmats,
+        filter_px2=filter_px2,
+        antialiased=bool(asset.antialiased),
+        returns=returns,
     )
 
 
-def draw_sphere(
+def draw_rays(
     subject: Subject,
     camera: EquirectangularCamera,
     cut: CutRequest,
     background: Sequence[float],
+    device: str | Device,
     *,
     depth: bool,
-) -> Image:
+) -> RayImage:
     """Draw an equirectangular picture; its depth is the mean distance along the ray, by
     blend weight."""
     back_color = color_of(background, "background")
-    cast = cast_rays(subject, camera.core, cut)
-    table = camera.table
-    alpha = table.in_order(cast.alpha)
-    color = table.in_order(cast.color)
+    chosen_device = _device.resolve(device)
+    cast = cast_rays(subject, camera.core, camera.sensor_viewmat[None], cut, chosen_device)
+    color = cast.color[0]
+    alpha = cast.alpha[0]
     if any(back_color):
-        color += (1 - alpha[..., None]) * np.array(back_color, np.float32)
+        backdrop: Array = np.array(back_color, np.float32)
+        if chosen_device.is_cuda:
+            import torch
+
+            backdrop = torch.as_tensor(backdrop, device=str(chosen_device))
+        color += (1 - alpha[..., None]) * backdrop
     distance = None
     if depth:
-        distance = table.in_order(cast.range)
-    return Image(color, alpha, distance)
+        distance = cast.range[0]
+    return RayImage(color, alpha, distance, cast.gaussians[0])

@@ -20,7 +20,7 @@ from v3dg.render.frame import frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, mesh_device, sensor_of
+from v3dg.render.sensor import Channel, MeshLayer, sensor_of
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
 
@@ -143,8 +143,8 @@ class Renderer:
         check_camera(camera)
         subject = self._subject
         is_asset = isinstance(subject, Gaussians)
-        place = mesh_device(self._frame.device, subject)
-        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=place)
+        device = self._frame.device
+        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=device)
         shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
         cut_request = CutRequest(tolerance, budget, min_level, fade)
         request = FrameRequest(camera, cut_request, shade, cut, sensor=sensor)
@@ -184,12 +184,13 @@ class Renderer:
             tolerance: As in `v3dg.select`; so are `min_level` and `fade`. A batch has
                 no budget.
             background: As in `v3dg.render`; so are `min_transmittance` and `depth`.
-            channels: As in `v3dg.render`. On CUDA devices, batches support neither
-                channels other than depth nor `mesh`. Channels are always new arrays.
+            channels: As in `v3dg.render`. Channels without planes in `out` are new
+                arrays.
             mesh: As in `v3dg.render`, with planes (B, H, W).
-            out: Where to write; None for new arrays of colour, alpha and, if requested,
-                depth. They belong to the caller, and are valid once the result was read
-                or, on the same stream, once the buffers have their size.
+            out: Where to write colour and, if it has planes for them, alpha, depth and
+                channels; None for new arrays of colour, alpha and, if requested, depth.
+                They belong to the caller, and are valid once the result was read or, on
+                the same stream, once the buffers have their size.
 
         Raises:
             ValueError: An argument is invalid; if it is a camera, the message has its
@@ -197,7 +198,8 @@ class Renderer:
         """
         if not isinstance(cameras, CameraBatch):
             cameras = CameraBatch.of(cameras)
-        with_depth, sensor = sensor_of(channels, mesh, cameras, depth=depth)
+        device = self._frame.device
+        with_depth, sensor = sensor_of(channels, mesh, cameras, depth=depth, device=device)
         check_planes(out, with_depth=with_depth)
         subject = self._subject
         shade = shade_of(background, min_transmittance, is_asset=False, depth=with_depth)

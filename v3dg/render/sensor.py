@@ -12,16 +12,15 @@ import numpy as np
 from v3dg import _core
 from v3dg._device import CPU, Device
 from v3dg._numbers import MOST_FLOAT, check, check_type, one_of
-from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import numpy.typing as npt
+    import torch
 
     from v3dg._device import HostArray
     from v3dg.gaussians import Array
-    from v3dg.scene import Subject
 
 Channel: TypeAlias = Literal[
     "depth", "median_depth", "normal", "instance", "label", "weight", "clipped"
@@ -38,7 +37,7 @@ class _Planes(NamedTuple):
 
     color: Array
     depth: Array
-    coverage: Array
+    coverage: Array | None
     normal: Array | None
     instance: Array | None
     label: Array | None
@@ -50,7 +49,10 @@ class MeshLayer:
 
     Gaussians behind the meshes are hidden, and those in front are blended over them.
     The planes are (H, W) for one camera, or (B, H, W) for a batch. They are arrays, or
-    torch tensors, which are copied to the host.
+    torch tensors. If the depth is a tensor on a CUDA device, all planes must be tensors
+    there. They are read when the picture is drawn on that device, without copies to the
+    host and without checks of their values: where the depth is not positive and finite,
+    or the coverage is NaN, there is no mesh. Other planes are checked on the host.
 
     Attributes:
         color: (..., 3) colour of the meshes, not multiplied by coverage.
@@ -81,9 +83,12 @@ class MeshLayer:
         Raises:
             ValueError: A plane has the wrong shape or values.
         """
-        planes = self._planes
-        if device.is_cuda:
-            planes = _Planes(*(_on_device(plane, device) for plane in planes))
+        if device.is_cuda and _is_on_cuda(self.depth):
+            planes = self._planes_there(device)
+        elif device.is_cuda:
+            planes = _Planes(*(_on_device(plane, device) for plane in self._planes))
+        else:
+            planes = self._planes
         return _core.Mesh(
             color=planes.color,
             depth=planes.depth,
@@ -115,6 +120,20 @@ class MeshLayer:
             label=_ids(self.label, "label", shape),
         )
 
+    def _planes_there(self, device: Device) -> _Planes:
+        """Return the planes, which are tensors on a device, without waiting for it."""
+        one_of(self.light, "mesh.light", ("display", "linear"))
+        shape = tuple(self.depth.shape)
+        check("mesh.depth", len(shape) in (2, 3), f"shape (H, W) or (B, H, W), got {shape}")
+        return _Planes(
+            color=_tensor(self.color, "color", (*shape, 3), device, "float32"),
+            depth=_tensor(self.depth, "depth", shape, device, "float32"),
+            coverage=_tensor(self.coverage, "coverage", shape, device, "float32"),
+            normal=_tensor(self.normal, "normal", (*shape, 3), device, "float32"),
+            instance=_tensor(self.instance, "instance", shape, device, "int32"),
+            label=_tensor(self.label, "label", shape, device, "int32"),
+        )
+
     def _coverage(self, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         if self.coverage is None:
             return ((depth > 0) & np.isfinite(depth)).astype(np.float32)
@@ -129,6 +148,41 @@ class MeshLayer:
         _refuse_any(normal, ~np.isfinite(normal), "normal", "finite numbers")
         length = np.linalg.norm(normal.astype(np.float64), axis=-1, keepdims=True)
         return np.ascontiguousarray(normal / np.where(length > 0, length, 1), np.float32)
+
+
+def _is_on_cuda(plane: Array) -> bool:
+    return bool(getattr(plane, "is_cuda", False))
+
+
+def _tensor(
+    plane: Array | None,
+    name: str,
+    shape: tuple[int, ...],
+    device: Device,
+    dtype: Literal["float32", "int32"],
+) -> torch.Tensor | None:
+    """Return a plane on a device with a type and in one piece; None stays None. Raise
+    ValueError for a plane of another shape, on another device or of another kind."""
+    if plane is None:
+        return None
+    import torch
+
+    is_there = isinstance(plane, torch.Tensor) and str(plane.device) == str(device)
+    text = f"a tensor on {device}, as the depth is"
+    check(f"mesh.{name}", is_there, f"{text}, got {_kind_of(plane)}")
+    tensor: torch.Tensor = plane
+    check(f"mesh.{name}", tuple(tensor.shape) == shape, f"shape {shape}, got {tuple(tensor.shape)}")
+    is_whole = tensor.dtype in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+    fits = is_whole or (dtype == "float32" and tensor.dtype.is_floating_point)
+    check(f"mesh.{name}", fits, f"numbers for {dtype}, got {tensor.dtype}")
+    return tensor.detach().to(getattr(torch, dtype)).contiguous()
+
+
+def _kind_of(plane: Array) -> str:
+    device = getattr(plane, "device", None)
+    if device is None:
+        return type(plane).__name__
+    return f"one on {device}"
 
 
 def _on_device(plane: Array | None, device: Device) -> Array | None:
@@ -192,14 +246,6 @@ def _refuse_any(
     raise ValueError(f"mesh.{name}: expected {expected}, got {array[place]} at [{text}]")
 
 
-def mesh_device(device: Device, subject: Subject) -> Device:
-    """Return the device on which meshes are drawn with a subject. On CUDA, channels and
-    meshes are supported only for assets so far."""
-    if isinstance(subject, Gaussians):
-        return device
-    return CPU
-
-
 def sensor_of(
     channels: Sequence[Channel],
     mesh: MeshLayer | None,
@@ -209,7 +255,7 @@ def sensor_of(
     device: Device = CPU,
 ) -> tuple[bool, _core.Sensor | None]:
     """Return whether depth is drawn, and the request for other channels and meshes, or
-    None without any. The planes of the mesh are copied to a device.
+    None without any. The planes of the mesh are brought to a device.
 
     Raises:
         TypeError: `channels` is not a sequence of names, or `mesh` is not a

@@ -46,7 +46,8 @@ class PictureVectorEnv(VectorEnv):
         num_envs: N.
         single_action_space: The actions of one environment.
         K: (3, 3) focal lengths and principal point of all cameras in px.
-        width, height: Size of the pictures in px.
+        width: Width of the pictures in px.
+        height: Height of the pictures in px.
         near: As in `CameraBatch`.
         max_steps: Steps after which an episode is truncated.
         background: Colour behind the scene.

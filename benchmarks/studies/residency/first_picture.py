@@ -106,7 +106,7 @@ def write_joined(config: Config) -> Path:
             made_hashes.append(np.tile(hashes[pages], (count, 1)))
         roots = v3dg.Gaussians.concatenate([one.read_page(one.num_pages - 1)] * count)
         run = plan.run(plan.layout.num_pages - 1, plan.layout.num_pages)
-        made_hashes.append(write_pages(out.fileno(), run, codec, roots))
+        made_hashes.append(write_pages(out.name, out.fileno(), run, codec, roots))
         plan.write_tables(out.fileno(), made, made_groups, np.concatenate(made_hashes))
         plan.write_header(out.fileno())
     return path

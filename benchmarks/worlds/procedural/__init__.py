@@ -7,6 +7,7 @@ parts depend on the view.
 
 from benchmarks.worlds.procedural.donut import make_donut
 from benchmarks.worlds.procedural.person import make_person
+from benchmarks.worlds.procedural.room import make_room
 from benchmarks.worlds.procedural.temple import make_temple
 from benchmarks.worlds.procedural.toadstools import make_asset, place_field
 from benchmarks.worlds.procedural.tree import TREE_KINDS, make_tree
@@ -16,6 +17,7 @@ __all__ = [
     "make_asset",
     "make_donut",
     "make_person",
+    "make_room",
     "make_temple",
     "make_tree",
     "place_field",

@@ -279,6 +279,10 @@ def _calls(shared, work):
         mesh = v3dg.MeshLayer(**values)
         v3dg.render(scene, camera, mesh=mesh, channels=channels, device="cpu")
 
+    def drawn_into(**values):
+        planes = v3dg.BatchPlanes(**values)
+        v3dg.Renderer(scene, device="cpu").render_batch([camera, camera], out=planes)
+
     def tables(**values):
         kind = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
         mine = {
@@ -400,6 +404,19 @@ def _calls(shared, work):
             {"environment": np.array([0, 3]), "ids": [0, 2]},
         ),
         "Scene.set_label": (changed("set_label"), {"label": np.array([0, 3]), "ids": [0, 2]}),
+        "BatchPlanes": (
+            drawn_into,
+            {
+                "color": np.zeros((2, 6, 8, 3), np.float32),
+                "alpha": np.zeros((2, 6, 8), np.float32),
+                "depth": np.zeros((2, 6, 8), np.float32),
+                "median_depth": np.zeros((2, 6, 8), np.float32),
+                "normal": np.zeros((2, 6, 8, 3), np.float32),
+                "instance": np.zeros((2, 6, 8), np.int32),
+                "label": np.zeros((2, 6, 8), np.int32),
+                "weight": np.zeros((2, 6, 8), np.float32),
+            },
+        ),
         "MeshLayer": (
             drawn_among,
             {

@@ -177,7 +177,7 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
 
         def write(first, last, gaussians):
             hashes[first:last] = write_pages(
-                output.fileno(), file.run(first, last), codec, gaussians
+                output.name, output.fileno(), file.run(first, last), codec, gaussians
             )
 
         for group in np.random.default_rng(0).permutation(num_groups):

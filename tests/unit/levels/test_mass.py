@@ -1,11 +1,15 @@
-"""Cuts keep the total alpha and colour of faint assets."""
+"""Cuts keep the total alpha and colour of assets that are faint, or dark with bright
+spots."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import v3dg
 from devices import host
-from v3dg import BuildConfig
+from v3dg import BuildConfig, _device
+from v3dg.levels import refined
 
 SAMPLES = 8
 DISTANCE = 14.0
@@ -25,8 +29,25 @@ def faint_cloud():
     )
 
 
+@pytest.fixture(scope="module")
+def dark_ball():
+    """Return a ball of 3,000 gaussians whose median is dark and whose mean is not."""
+    rng = np.random.default_rng(3)
+    count = 3_000
+    outwards = rng.normal(size=(count, 3))
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    brightness = np.where(rng.random((count, 1, 1)) < 0.12, 2.0, -1.5)
+    return v3dg.Gaussians(
+        means=(2 * outwards).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=rng.uniform(0.02, 0.08, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.6, 0.99, count).astype(np.float32),
+        sh=(brightness + rng.uniform(-0.1, 0.1, (count, 1, 3))).astype(np.float32),
+    )
+
+
 def cameras(width):
-    """Return views of the cloud from all sides, with this width in px."""
+    """Return views of the asset from all sides, with this width in px."""
     rng = np.random.default_rng(2)
     for _ in range(24):
         eye = rng.normal(size=3)
@@ -79,3 +100,31 @@ def test_a_faint_asset_has_no_filter(faint_cloud):
         bundle = v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
         first = bundle.level_range(1).start
         np.testing.assert_allclose(bundle.clusters.filter_px2[first], filter_px2, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def drafts(faint_cloud, dark_ball):
+    """Return bundles as they are built."""
+    return [
+        (asset, v3dg.build_bundle(asset, device="cpu", progress=False, quality="draft"))
+        for asset in (faint_cloud, dark_ball)
+    ]
+
+
+def test_refined_cuts_keep_alpha_and_colour(drafts, device):
+    pictures = 1_000 * refined.default_steps(_device.resolve(device)).windows
+    for asset, bundle in drafts:
+        moved = v3dg.refine_bundle(bundle, steps=pictures, device=device, progress=False)
+        np.testing.assert_allclose(ratios(asset, moved, 14, device), 1, atol=0.025)
+
+
+@pytest.mark.slow
+def test_a_refinement_by_pixels_and_cells_alone_darkens(drafts, monkeypatch):
+    """The medians of small cells are below their means, too."""
+    plain = refined.default_steps
+    monkeypatch.setattr(
+        refined, "default_steps", lambda device: replace(plain(device), window_means=0.0)
+    )
+    for asset, bundle in drafts:
+        moved = v3dg.refine_bundle(bundle, steps=1_000, device="cpu", progress=False)
+        assert (ratios(asset, moved, 14, "cpu")[:3] < 0.977).all()

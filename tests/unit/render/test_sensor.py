@@ -10,7 +10,7 @@ import scenes_lod
 import v3dg
 from frames import composed_scene
 from random_bundle import random_bundle
-from v3dg import Camera, MeshLayer, Scene, _core
+from v3dg import BatchPlanes, Camera, MeshLayer, Scene, _core
 from v3dg._device import CPU
 from v3dg.render import shade_of
 from v3dg.residency import residency
@@ -33,9 +33,11 @@ def camera_at(eye=(0, -6, 1)):
 
 
 def mesh_of(shape, seed=0, **planes):
+    """Return a mesh before, between and behind the gaussians of the scene."""
     rng = np.random.default_rng(seed)
     coverage = rng.choice([0.0, 0.4, 1.0], shape)
-    return MeshLayer(rng.uniform(0, 1, (*shape, 3)), rng.uniform(3, 9, shape), coverage, **planes)
+    depth = np.exp(rng.uniform(np.log(0.03), np.log(30), shape))
+    return MeshLayer(rng.uniform(0, 1, (*shape, 3)), depth, coverage, **planes)
 
 
 def assert_same(image, other, planes=PLANES):
@@ -95,6 +97,7 @@ def test_a_batch_has_the_channels_of_each_camera_alone(scene):
     renderer = v3dg.Renderer(scene, device="cpu")
     batch = renderer.render_batch(cameras, channels=CHANNELS, mesh=mesh)
     assert batch.normal.shape == (5, HEIGHT, WIDTH, 3)
+    assert 0.1 < (batch.instance == 99).mean() < 0.9
     for number, camera in enumerate(cameras):
         layer = MeshLayer(
             mesh.color[number],
@@ -106,6 +109,44 @@ def test_a_batch_has_the_channels_of_each_camera_alone(scene):
         assert_same(batch[number], alone)
     at_once = v3dg.render(scene, cameras, channels=CHANNELS, device="cpu")
     assert_same(at_once[3], v3dg.render(scene, cameras[3], channels=CHANNELS, device="cpu"))
+
+
+def test_planes_of_the_caller_are_written(scene):
+    cameras = v3dg.turntable((0, 0, 0), 6.0, 5, width=WIDTH, height=HEIGHT)
+    mesh = mesh_of((5, HEIGHT, WIDTH))
+    renderer = v3dg.Renderer(scene, device="cpu")
+    expected = renderer.render_batch(cameras, channels=CHANNELS, mesh=mesh)
+    shape = (5, HEIGHT, WIDTH)
+    planes = BatchPlanes(
+        np.full((*shape, 4), 7, np.float32),
+        median_depth=np.full(shape, 7, np.float32),
+        normal=np.full((*shape, 3), 7, np.float32),
+        instance=np.full(shape, 7, np.int32),
+        label=np.full(shape, 7, np.int32),
+        weight=np.full(shape, 7, np.float32),
+    )
+    batch = renderer.render_batch(cameras, channels=["clipped"], mesh=mesh, out=planes)
+    assert_same(batch, expected, CHANNELS[1:])
+    np.testing.assert_array_equal(planes.color[..., :3], expected.color)
+    for channel in CHANNELS[1:-1]:
+        assert getattr(batch, channel) is getattr(planes, channel)
+        assert getattr(batch.planes, channel) is getattr(planes, channel)
+    with pytest.raises(AttributeError, match="depth: expected"):
+        batch.depth  # noqa: B018 - which raises
+
+
+def test_wrong_planes_of_channels_are_refused(scene):
+    color = np.zeros((1, HEIGHT, WIDTH, 3), np.float32)
+    renderer = v3dg.Renderer(scene, device="cpu")
+    cases = [
+        ({"normal": np.zeros((1, HEIGHT, WIDTH), np.float32)}, ValueError, "normal: expected"),
+        ({"label": np.zeros((1, HEIGHT, WIDTH), np.float32)}, ValueError, "label: expected"),
+        ({"weight": np.zeros((1, HEIGHT, 3), np.float32)}, ValueError, "weight: expected"),
+        ({"instance": [[[3]]]}, TypeError, "instance: expected"),
+    ]
+    for planes, kind, text in cases:
+        with pytest.raises(kind, match=text):
+            renderer.render_batch([camera_at()], out=BatchPlanes(color, **planes))
 
 
 def test_cameras_of_an_environment_name_the_instances_of_the_scene():

@@ -20,11 +20,16 @@ const HOST = {
 
 /** A loaded module: its memory, and the calls of core.cpp. */
 export class Core {
-  /** @param {BufferSource} bytes The module, as csrc/wasm/build.py makes it. */
-  static async load(bytes) {
-    const { instance } = await WebAssembly.instantiate(bytes, { wasi_snapshot_preview1: HOST });
-    instance.exports._initialize?.();
-    return new Core(instance.exports);
+  /**
+   * @param {BufferSource | WebAssembly.Module} code The module, as csrc/wasm/build.py makes
+   *   it, or what it was compiled to.
+   */
+  static async load(code) {
+    const made = await WebAssembly.instantiate(code, { wasi_snapshot_preview1: HOST });
+    const { exports } = made.instance ?? made;
+    const { _initialize: initialize } = exports;
+    initialize?.();
+    return new Core(exports);
   }
 
   constructor(exports) {
@@ -69,6 +74,48 @@ export class Core {
     const hash = this.read(Uint8Array, this.result, 16);
     this.calls.v3dg_free(message);
     return hash;
+  }
+
+  /**
+   * End by a trap, after which the module must be loaded again, unless tables that a file
+   * contains are valid.
+   * @param {object} tables See bundle_file.js.
+   */
+  checkTables(tables) {
+    const places = [
+      tables.offset,
+      tables.level,
+      tables.ownGroup,
+      tables.parentGroup,
+      tables.box,
+      tables.filter,
+      tables.antialiased,
+      tables.ball,
+      tables.weight,
+      tables.groupParent,
+      tables.groupLevel,
+      tables.groupError,
+    ].map((array) => this.copy(array));
+    const argument = this.copy(
+      Uint32Array.from([tables.weight.length, tables.ownGroup.length, ...places]),
+    );
+    this.calls.v3dg_check_tables(argument);
+    [...places, argument].forEach((place) => this.calls.v3dg_free(place));
+  }
+
+  /**
+   * Whether all gaussians of a coded page are finite.
+   * @param {BigInt64Array} offset First row of each cluster, and the end.
+   * @param {Uint8Array} bytes The page.
+   * @param {number} degree Degree of the spherical harmonics.
+   */
+  isValidPage(offset, bytes, degree) {
+    const relative = BigInt64Array.from(offset, (row) => row - offset[0]);
+    const places = [this.copy(relative), this.copy(bytes)];
+    const clusters = offset.length - 1;
+    const valid = this.calls.v3dg_check_page(places[0], clusters, places[1], degree);
+    places.forEach((place) => this.calls.v3dg_free(place));
+    return valid === clusters;
   }
 
   /**

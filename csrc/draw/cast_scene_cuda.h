@@ -1,0 +1,96 @@
+#pragma once
+
+// Casts the rays of a spherical sensor on a CUDA device, at many poses.
+
+#include <vector>
+
+#include "draw/cast_scene.h"
+#include "draw/scene_frame_cuda.h"
+#include "rays/rays_cuda.h"
+
+namespace v3dg {
+namespace cuda {
+
+// Poses on the device: (B, 4, 4) from the world to the sensor. At a pose that is no
+// rigid motion, the sensor sees nothing.
+struct RayPoses {
+    const void* viewmats;
+    bool are_double;
+    uint32_t count;
+};
+
+// The directions of a sensor, in device memory.
+class DeviceRayGrid {
+  public:
+    // Copies the directions, unless they are there already.
+    const RayDirections& load(const std::shared_ptr<const RayGrid>& grid, cudaStream_t stream);
+
+  private:
+    std::shared_ptr<const RayGrid> grid_;
+    DeviceBuffer<float> floats_;
+    DeviceBuffer<int32_t> ints_;
+    RayDirections directions_{};
+};
+
+// Casts rays through scenes of the same bundles, or through assets. The buffers are
+// reused from cast to cast. Poses are cast in parts whose gaussians fit into bounded
+// memory. Each part waits once, for the numbers of its records and entries; the rest of
+// its work may be in progress on return.
+class RayFrame {
+  public:
+    // Sets the gaussians of each bundle of the scene.
+    void set_models(std::vector<DeviceModel> models, cudaStream_t stream);
+
+    // Casts all rays through the cut of a scene at each pose; the cuts have no frustum.
+    // The planes follow each other. Returns the number of selected gaussians at each
+    // pose. `rule` has no budget. Throws OutOfMemory, or std::length_error if one pose
+    // has too many rays or entries.
+    std::vector<int64_t> cast_scene(const SceneTables& scene, const RaySensor& sensor,
+                                    const RayPoses& poses, SelectRule rule, const RayPlanes& planes,
+                                    cudaStream_t stream);
+
+    // Casts all rays through all gaussians of one asset.
+    std::vector<int64_t> cast_model(const GaussianRows<const float>& rows,
+                                    const Appearance<float>& appearance, const RaySensor& sensor,
+                                    const RayPoses& poses, const RayPlanes& planes,
+                                    cudaStream_t stream);
+
+  private:
+    struct Subject;
+    struct Counts;
+    std::vector<int64_t> cast(const Subject& subject, const RaySensor& sensor,
+                              const RayPoses& poses, const RayPlanes& planes, cudaStream_t stream);
+    // Casts poses [first, first + count); returns the counts of gaussians.
+    std::vector<int64_t> cast_part(const Subject& subject, const RaySensor& sensor,
+                                   const CameraArrays& poses, uint32_t first, uint32_t count,
+                                   const RayPlanes& planes, cudaStream_t stream);
+    // Enqueues the cut and the projection.
+    RayLists project(const Subject& subject, const RaySensor& sensor, const BatchViews& views,
+                     const RayDirections& rays, unsigned char* cleared, cudaStream_t stream);
+    RayInput write_items(const Subject& subject, const BatchViews& views, const ItemList& items,
+                         cudaStream_t stream);
+    void release_buffers();
+
+    std::vector<DeviceModel> models_;
+    DeviceBuffer<GaussianRows<const float>> rows_, asset_;
+    DeviceBuffer<CodedGaussians> coded_;
+    bool has_rows_ = false, has_coded_ = false;
+    Cut cut_;
+    DeviceRayGrid grid_;
+    DeviceBuffer<double> intrinsics_;
+    DeviceBuffer<BatchCamera> cameras_;
+    DeviceBuffer<FrameImage> images_;
+    DeviceBuffer<Placement> placements_;
+    DeviceBuffer<InstanceFactors> factors_;
+    DeviceBuffer<unsigned char> counters_;
+    DeviceBuffer<DrawItem> items_;
+    DeviceBuffer<RayRecord> records_;
+    DeviceBuffer<uint64_t> entries_;
+    RaySortBuffers sorted_;
+    size_t item_capacity_ = 1 << 12, record_capacity_ = 1 << 16, entry_capacity_ = 1 << 17;
+    uint32_t most_poses_ = 1;  // largest number of poses in the next part
+    StreamMutex busy_;
+};
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,143 @@
+#pragma once
+
+// The directions of a sensor's rays, and the search for those in a box of directions,
+// for the host and for devices. rays.h has the owner of the memory.
+
+#include <cstddef>
+#include <cstdint>
+
+#include "rays/ray_math.h"
+
+namespace v3dg {
+
+constexpr int kRayTileColumns = 16, kRayTileRows = 8;
+constexpr int kRayTileSize = kRayTileColumns * kRayTileRows;
+constexpr float kTurn = static_cast<float>(2 * kPi);
+
+// Ascending angles, and where to begin a search among them.
+struct AngleTable {
+    const float* angles;
+    const int32_t* first_in_bucket;  // [size + 1] buckets of equal width
+    int size;
+    float buckets_per_radian;
+
+    // Returns the index of the first angle that is not below `value`; 0 for NaN.
+    V3DG_HD int first_from(float value) const {
+        const float first = angles[0];
+        if (!(value > first)) return 0;
+        if (value > angles[size - 1]) return size;
+        const int bucket = static_cast<int>((value - first) * buckets_per_radian);
+        int i = first_in_bucket[bucket < size ? bucket : size];
+        // Rounding may lead to a neighbouring bucket.
+        while (i > 0 && angles[i - 1] >= value) --i;
+        while (angles[i] < value) ++i;
+        return i;
+    }
+    // Returns the index of the last angle that is not above `value`, or -1.
+    V3DG_HD int last_up_to(float value) const {
+        int i = first_from(value);
+        while (i < size && angles[i] <= value) ++i;
+        return i - 1;
+    }
+};
+
+// The rays in a box of directions: rows and columns from the first to the last. The
+// last column may exceed the number of columns; columns then go on from 0.
+struct RayRange {
+    int32_t row0, row1, column0, column1;
+
+    V3DG_HD bool is_empty() const { return row0 > row1 || column0 > column1; }
+};
+
+// The tiles that a range reaches: rows and columns from the first on. The last column
+// may exceed the number of columns of tiles; columns then go on from 0.
+struct RayTiles {
+    int32_t row, column;
+    uint32_t num_rows, num_columns;
+
+    V3DG_HD uint32_t count() const { return num_rows * num_columns; }
+};
+
+// The directions of the rays. In view space x is forward, y left and z up; azimuths
+// turn from x to y, and elevations are above the xy plane. The tables ascend; azimuths
+// are in [0, 2 pi), elevations in [-pi/2, pi/2].
+struct RayDirections {
+    AngleTable azimuth, elevation;
+    // The cosines and sines of the angles, padded with zeros to whole tiles.
+    const float *azimuth_cosine, *azimuth_sine, *elevation_cosine, *elevation_sine;
+    // The column and the row of the sensor's picture for each angle.
+    const int32_t *column_place, *row_place;
+
+    V3DG_HD int num_columns() const { return azimuth.size; }
+    V3DG_HD int num_rows() const { return elevation.size; }
+    V3DG_HD int tile_columns() const {
+        return (num_columns() + kRayTileColumns - 1) / kRayTileColumns;
+    }
+    V3DG_HD int tile_rows() const { return (num_rows() + kRayTileRows - 1) / kRayTileRows; }
+    V3DG_HD size_t num_tiles() const { return size_t(tile_columns()) * tile_rows(); }
+    V3DG_HD size_t num_rays() const { return size_t(num_columns()) * num_rows(); }
+
+    // Returns where a ray is in the planes of the picture.
+    V3DG_HD size_t place(int row, int column) const {
+        return size_t(row_place[row]) * num_columns() + column_place[column];
+    }
+
+    V3DG_HD RayRange range_of(const DirectionBox<float>& box) const {
+        RayRange range{.row0 = elevation.first_from(box.elevation0),
+                       .row1 = elevation.last_up_to(box.elevation1),
+                       .column0 = 0,
+                       .column1 = num_columns() - 1};
+        if (range.row0 > range.row1 || !(box.azimuth1 - box.azimuth0 < kTurn)) return range;
+        const float turns = ::floorf(box.azimuth0 / kTurn) * kTurn;
+        // The subtraction rounds, so the margin is once more added to its results.
+        const float start = box.azimuth0 - turns - kDirectionMargin;
+        const float end = box.azimuth1 - turns + kDirectionMargin;
+        range.column0 = azimuth.first_from(start);
+        range.column1 =
+            end < kTurn ? azimuth.last_up_to(end) : num_columns() + azimuth.last_up_to(end - kTurn);
+        const int last = range.column0 + num_columns() - 1;
+        if (range.column1 > last) range.column1 = last;
+        return range;
+    }
+
+    V3DG_HD RayTiles tiles_of(const RayRange& range) const {
+        const int columns = tile_columns(), row = range.row0 / kRayTileRows;
+        const int column = range.column0 / kRayTileColumns;
+        int last = range.column1 / kRayTileColumns;
+        // Columns behind the last continue from the first tile, which may be reached
+        // twice.
+        if (range.column1 >= num_columns())
+            last = columns + (range.column1 - num_columns()) / kRayTileColumns;
+        if (last > column + columns - 1) last = column + columns - 1;
+        return {.row = row,
+                .column = column,
+                .num_rows = static_cast<uint32_t>(range.row1 / kRayTileRows - row + 1),
+                .num_columns = static_cast<uint32_t>(last - column + 1)};
+    }
+    // Returns the index of the k-th tile.
+    V3DG_HD uint32_t tile(const RayTiles& tiles, uint32_t k) const {
+        const auto columns = static_cast<uint32_t>(tile_columns());
+        const uint32_t column = static_cast<uint32_t>(tiles.column) + k % tiles.num_columns;
+        const uint32_t row = static_cast<uint32_t>(tiles.row) + k / tiles.num_columns;
+        return row * columns + (column < columns ? column : column - columns);
+    }
+};
+
+// A gaussian that reaches rays. It fills two cache lines.
+struct alignas(64) RayRecord {
+    RayShape<float> shape;
+    float color[3];
+    float nearest;  // no ray has a hit in front of this distance
+    RayRange range;
+    uint32_t order;  // ascends in the order of the draws; breaks ties of distances
+};
+static_assert(sizeof(RayRecord) == 128, "a record fills two cache lines");
+
+// The distances between which hits count, and how rays end.
+struct RayLimits {
+    float nearest, farthest;
+    float spacing;            // px of a screen-space filter, in radians
+    float min_transmittance;  // a ray ends when less than this is left
+};
+
+}  // namespace v3dg
