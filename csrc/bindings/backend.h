@@ -201,7 +201,7 @@ class Frame {
     // draws_only_plainly is false.
     virtual bool pick(const FrameInput& input, ScenePick& picked) = 0;
     // Returns the device memory of the frame in bytes, by part, and the bytes of the
-    // memory pool from which all parts are allocated.
+    // memory pool, from which all parts but the large buffers of a frame are allocated.
     virtual std::vector<std::pair<const char*, size_t>> memory() const = 0;
 };
 
