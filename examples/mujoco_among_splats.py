@@ -41,7 +41,8 @@ MODEL = f"""
     <light pos="-.6 -1 2" dir=".3 .5 -1" diffuse=".7 .7 .7" castshadow="true"/>
     <camera name="room" pos=".45 -1.3 .6" xyaxes="1 .28 0 -.1 .32 .95" fovy="40"/>
     <geom name="floor" type="plane" size="1.2 1.2 .1" material="floor"/>
-    <geom type="cylinder" pos="-.35 0 .06" size=".12 .06" material="dark"/>
+    <geom type="cylinder" pos="-.35 0 .06" size=".12 .06" material="dark" contype="0"
+      conaffinity="0"/>
     <body name="turret" pos="-.35 0 .12">
       <joint name="yaw" axis="0 0 1" damping="2"/>
       <geom type="cylinder" size=".08 .05" material="steel"/>
@@ -114,16 +115,21 @@ def make_scene(config: Config) -> v3dg.Scene:
     return scene
 
 
-def main(config: Config) -> v3dg.RenderedImage:
-    """Simulate, and draw the last state; return the picture of the room."""
+def simulate(seconds: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Return the model and its state after the arm has swept over the floor."""
     model = mujoco.MjModel.from_xml_string(MODEL)
     data = mujoco.MjData(model)
     data.qpos[:4] = START
     mujoco.mj_forward(model, data)
-    num_steps = round(config.seconds / model.opt.timestep)
-    for share in np.linspace(0, 1, num_steps):
+    for share in np.linspace(0, 1, round(seconds / model.opt.timestep)):
         data.ctrl[:] = (1 - share) * np.array(START) + share * np.array(END)
         mujoco.mj_step(model, data)
+    return model, data
+
+
+def main(config: Config) -> v3dg.RenderedImage:
+    """Simulate, and draw the last state; return the picture of the room."""
+    model, data = simulate(config.seconds)
     width, height = config.size
     with SplatRenderer(
         model, make_scene(config), width=width, height=height, device=config.device

@@ -1,5 +1,5 @@
 """The renderer for Isaac Lab, driven by the classes that Isaac Lab itself uses for
-that: `RenderContext`, `CameraRenderSpec`, `CameraData` and `ProxyArray`."""
+that: `RenderContext`, `CameraCfg`, `CameraData` and `ProxyArray`."""
 
 import math
 
@@ -16,7 +16,9 @@ renderers = pytest.importorskip(
     "isaaclab.renderers", reason="isaaclab is older than 3.0", exc_type=ImportError
 )
 
+from isaaclab.sensors.camera import CameraCfg  # noqa: E402
 from isaaclab.sensors.camera.camera_data import CameraData  # noqa: E402
+from isaaclab.sim import PinholeCameraCfg  # noqa: E402
 from isaaclab.utils.warp import ProxyArray  # noqa: E402
 
 from v3dg.simulators.isaaclab import SplatRenderer, SplatRendererCfg  # noqa: E402
@@ -38,15 +40,18 @@ def path(tmp_path_factory):
     return path
 
 
-class CameraSettings:
-    """The fields of `CameraCfg` that renderers read. The class itself needs OpenUSD's
-    physics schemas, which only Isaac Sim has."""
-
-    width = SIZE
-    height = SIZE
-    spawn = None
-    background_color = (0.2, 0.4, 0.6)
-    data_types = ALL
+def spec_of(spawn):
+    """Return the description of a camera that `Camera` passes to its renderer."""
+    settings = CameraCfg(
+        prim_path="/World/envs/env_.*/camera",
+        width=SIZE,
+        height=SIZE,
+        data_types=ALL,
+        spawn=spawn,
+        background_color=(0.2, 0.4, 0.6),
+        renderer_cfg=SplatRendererCfg(),
+    )
+    return renderers.CameraRenderSpec(settings, "cpu", NUM_ENVS, (), NUM_ENVS)
 
 
 def proxies(eyes, turns):
@@ -64,8 +69,7 @@ def draw(renderer, eyes, turns, *, stage=None, data_types=ALL):
     context = renderers.RenderContext([(renderer.cfg, renderer)])
     context.ensure_initialize()
     context.ensure_prepare_stage(stage, NUM_ENVS)
-    spec = renderers.CameraRenderSpec(CameraSettings(), "cpu", NUM_ENVS, (), NUM_ENVS)
-    data = renderer.create_render_data(spec)
+    data = renderer.create_render_data(spec_of(PinholeCameraCfg()))
     camera_data = CameraData.allocate(
         data_types=data_types,
         height=SIZE,
@@ -174,8 +178,7 @@ def test_instances_of_the_scene_can_be_moved_and_have_labels(path):
 
 def test_intrinsics_can_change(path):
     renderer = SplatRenderer(SplatRendererCfg(path=str(path)))
-    spec = renderers.CameraRenderSpec(CameraSettings(), "cpu", NUM_ENVS, (), NUM_ENVS)
-    data = renderer.create_render_data(spec)
+    data = renderer.create_render_data(spec_of(PinholeCameraCfg()))
     *_, intrinsics = proxies([(0, 0, 0)] * NUM_ENVS, [turn_about_z(0)] * NUM_ENVS)
     renderer.update_camera_intrinsics(data, intrinsics.warp, None)
     np.testing.assert_array_equal(data.K.numpy(), intrinsics.torch.numpy())
@@ -188,13 +191,14 @@ def test_assets_without_levels_are_refused(tmp_path):
         SplatRenderer(SplatRendererCfg(path=str(path))).prepare_stage(None, 1)
 
 
-def test_lens_distortion_is_refused():
-    class Lens:
-        distortion = object()
-        clipping_range = (0.1, 100.0)
+def test_near_plane_is_that_of_the_camera():
+    renderer = SplatRenderer(SplatRendererCfg())
+    spec = spec_of(PinholeCameraCfg(clipping_range=(0.25, 10.0)))
+    assert renderer.create_render_data(spec).near == 0.25
 
-    settings = CameraSettings()
-    settings.spawn = Lens()
-    spec = renderers.CameraRenderSpec(settings, "cpu", NUM_ENVS, (), NUM_ENVS)
+
+def test_lens_distortion_is_refused():
+    spec = spec_of(PinholeCameraCfg())
+    spec.cfg.spawn.distortion = object()
     with pytest.raises(ValueError, match=r"spawn\.distortion: expected a pinhole camera"):
         SplatRenderer(SplatRendererCfg()).create_render_data(spec)

@@ -32,6 +32,9 @@ from v3dg.simulators.mujoco import (  # noqa: E402
     cameras_of,
 )
 
+sys.path.append(str(Path(__file__).parents[3] / "examples"))
+import mujoco_among_splats  # noqa: E402
+
 WIDTH = 160
 HEIGHT = 120
 CAMERAS = ("plain", "lens", "on_body", -1)
@@ -242,10 +245,15 @@ def test_orthographic_cameras_are_refused():
         camera_of(model, data, "plain", width=8, height=8)
 
 
-def test_example_draws_an_arm_that_moves_a_donut(drawable, tmp_path):
-    sys.path.append(str(Path(__file__).parents[3] / "examples"))
-    import mujoco_among_splats
+def test_example_pushes_the_donut():
+    _, before = mujoco_among_splats.simulate(0)
+    _, after = mujoco_among_splats.simulate(2)
+    shift = after.body("donut").xpos - before.body("donut").xpos
+    assert np.linalg.norm(shift[:2]) > 0.05
+    assert abs(shift[2]) < 0.02
 
+
+def test_example_draws_an_arm_that_moves_a_donut(drawable, tmp_path):
     path = tmp_path / "arm.png"
     config = mujoco_among_splats.Config(output=path, gaussians=1000, size=(160, 90), seconds=2.0)
     image = mujoco_among_splats.main(config)
