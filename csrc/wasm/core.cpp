@@ -225,8 +225,8 @@ void v3dg_select(WebScene* scene, const ViewValues* view, CutValues* out) {
             .weight = cut.weight.empty() ? nullptr : cut.weight.data()};
 }
 
-// Returns the number of clusters of a coded page, or the index of the first cluster whose
-// ranges are invalid. `offset` is as for v3dg_decode_page().
+// Returns the number of clusters of a coded page, or the index of the first cluster
+// whose ranges are invalid. `offset` is as for v3dg_decode_page().
 V3DG_EXPORT(v3dg_check_page)
 uint32_t v3dg_check_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
                          int32_t sh_degree) {
