@@ -19,8 +19,10 @@ PROGRAM = """
 import contextlib, importlib, json, pkgutil, resource, sys
 import numpy, PIL.Image, zstandard
 import v3dg
+# No command uses the adapters for simulators, whose packages may be missing.
+skipped = ("v3dg.viewer", "v3dg.simulators")
 for module in pkgutil.walk_packages(v3dg.__path__, "v3dg."):
-    if "viewer" not in module.name and not module.name.endswith("__main__"):
+    if not module.name.startswith(skipped) and not module.name.endswith("__main__"):
         importlib.import_module(module.name)
 from v3dg.cli import main, parse
 more = int(sys.argv.pop(1))
