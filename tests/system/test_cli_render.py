@@ -183,6 +183,18 @@ def test_panorama_shows_all_directions(render):
     assert not covered[:10].any()
 
 
+def test_panorama_is_drawn_from_the_camera_of_a_scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 500, size=0.4), 32).write("blob.v3dg")
+    camera = v3dg.Camera.look_at((0, -3, 0), (0, 0, 0), (0, 0, 1), width=64, height=32)
+    scene = v3dg.Scene.of(v3dg.Bundle.open("blob.v3dg"))
+    v3dg.write_scene("scene.json", scene, cameras={"front": camera})
+    command = ["render", "scene.json", "--device", "cpu", "--size", "128", "64"]
+    assert cli.main([*command, "--projection", "equirectangular", "-o", "around.png"]) == 0
+    assert pixels("around.png").any()
+
+
 def test_panoramas_of_a_budget_are_combined_from_pinholes(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)

@@ -116,8 +116,11 @@ def run(options: Render) -> None:
     subject, own_cameras = open_subject(options.subject, show=not options.quiet)
     notes: list[str] = []
     needs_up = options.view.needs_up(own_cameras)
+    up = options.view.up
     if needs_up or options.is_panorama:
-        options.view.up, notes = choose_up(options.view.up, subject, own_cameras, options.subject)
+        up, notes = choose_up(up, subject, own_cameras, options.subject)
+    if needs_up:
+        options.view.up = up
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
     _check_sizes(options, cameras)
     if options.seconds is not None:
@@ -127,7 +130,7 @@ def run(options: Render) -> None:
     is_sequence = options.is_film or (needs_up and len(cameras) > 1)
     if fade is None and is_sequence:
         fade = DEFAULT_FADE
-    style = _Style(background, fade, options.view.up or "z")
+    style = _Style(background, fade, up or "z")
     # With a fade, pictures count as a sequence, in which the tolerance of a budget
     # changes in steps.
     renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())

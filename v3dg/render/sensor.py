@@ -55,7 +55,8 @@ class MeshLayer:
     or the coverage is NaN, there is no mesh. Other planes are checked on the host.
 
     Attributes:
-        color: (..., 3) colour of the meshes, not multiplied by coverage.
+        color: (..., 3) colour of the meshes, 1 for white, not multiplied by coverage.
+            Divide 8-bit colours by 255.
         depth: (...) depth of the meshes along the camera's axis, in world units. A
             gaussian is in front if the depth of its centre is smaller.
         coverage: (...) fraction of the pixel that meshes cover, 0 to 1. None means 1
