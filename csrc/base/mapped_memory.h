@@ -2,10 +2,9 @@
 
 // Device memory that grows without moving, for buffers whose size follows a camera.
 //
-// Growing a buffer of a pool means to free it and to allocate a larger one, and it
-// takes as long as drawing several frames. Here a buffer has a range of addresses as
-// large as the memory of the device, and memory is mapped behind the part that is in
-// use.
+// To grow, a buffer of a pool must be freed and a larger one allocated, which takes as
+// long as drawing several frames. Here a buffer has a range of addresses as large as
+// the memory of the device, and memory is mapped behind the part that is in use.
 
 #include <vector>
 
@@ -31,8 +30,8 @@ class MappedMemory {
     static bool is_supported();
 
     // Makes room for `bytes`. The address stays the same, so work in progress is not
-    // affected. `stream` is a stream of the device. Throws OutOfMemory; what was
-    // reserved before stays.
+    // affected. `stream` is a stream of the device. Throws OutOfMemory; memory that was
+    // reserved before stays reserved.
     void* reserve(size_t bytes, cudaStream_t stream);
     void* data() const { return reinterpret_cast<void*>(first_); }
     size_t bytes() const { return num_bytes_; }

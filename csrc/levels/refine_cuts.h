@@ -22,8 +22,8 @@ struct CutComparison {
     // kMostWindows.
     int windows_per_step;
     int cuts_per_view;  // cuts that are compared with each picture of the target
-    // Weight of the |mean difference| of a window, relative to LossWeights::l1 and
-    // LossWeights::alpha.
+    // Weight of the absolute mean difference of a window, relative to LossWeights::l1
+    // and LossWeights::alpha.
     float window_means;
 };
 constexpr int kMostWindows = 32;

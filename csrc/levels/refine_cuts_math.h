@@ -108,9 +108,9 @@ struct WindowSlopes {
 // Sets the gradient of the loss of a window's sums at each pixel. That loss is linear in
 // the difference of the sums, and quadratic where the difference is smaller than
 // kSmallMeans of the target's sum, so that it hardly disturbs windows whose sums are
-// right. The |differences| of pixels and cells are least at medians. These are darker
-// than means, and thinner where gaussians are faint. A colour counts as at least
-// kLeastColor of alpha, because a relative error of black is not visible.
+// right. The absolute differences of pixels and cells are least at medians. Medians are
+// darker than means, and have less alpha where gaussians are faint. A colour counts as
+// at least kLeastColor of alpha, because a relative error of black is not visible.
 constexpr double kSmallMeans = 0.02, kLeastColor = 0.1;
 constexpr double kLeastSum = 1e-30;  // keeps the quotient finite where the target is empty
 V3DG_HD inline void put_slopes_of_means(const LossWeights& loss, float means,

@@ -21,10 +21,10 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-// Most multiprocessors have room for few blocks' shared memory, but for more warps. So
-// there are two sizes of blocks: narrow ones for multiprocessors with 228 KiB of shared
-// memory, and wide ones, twice the warps of which share a block's memory. Both draw the
-// same bits.
+// On most multiprocessors, shared memory limits the number of blocks before the number
+// of warps does. So there are two sizes of blocks: narrow ones for multiprocessors with
+// 228 KiB of shared memory, and wide ones, in which twice as many warps share the
+// memory of a block. Both draw the same bits.
 using Narrow = BlendShared<128>;
 using Wide = BlendShared<256>;
 // The number of blocks per multiprocessor for which registers suffice, without depth.

@@ -165,7 +165,7 @@ V3DG_EXPORT(v3dg_allocate) void* v3dg_allocate(uint32_t bytes) { return allocate
 V3DG_EXPORT(v3dg_free) void v3dg_free(void* memory) { free_pages(memory); }
 
 // Returns if the tables are valid; otherwise ends by a trap. The number of gaussians is
-// what the tables say.
+// taken from the tables.
 V3DG_EXPORT(v3dg_check_tables) void v3dg_check_tables(const FileArrays* in) {
     const size_t groups = in->num_groups, clusters = in->num_clusters;
     check_tables({.offset = {in->offset, clusters + 1},
