@@ -77,8 +77,8 @@ export class Core {
   }
 
   /**
-   * End by a trap, after which the module must be loaded again, unless tables that a file
-   * contains are valid.
+   * Check the tables of a file. If they are invalid, the module ends by a trap, and
+   * must be loaded again.
    * @param {object} tables See bundle_file.js.
    */
   checkTables(tables) {

@@ -123,8 +123,8 @@ export class PagePool {
   }
 
   /**
-   * Note what the cut of a frame needs of a bundle. Returns the absent pages, those above
-   * before those below.
+   * Store which pages of a bundle the cut of a frame needs. Returns the absent pages,
+   * those above before those below.
    *
    * @param {number} bundle
    * @param {Float32Array} needs Priority of each page; 0 if it is not needed.
@@ -181,8 +181,8 @@ export class PagePool {
   }
 
   /**
-   * Return the slot of a page that was not needed by the last cut, after the page has
-   * left it; NO_SLOT if there is none.
+   * Remove a page that the last cut did not need. Returns its slot; NO_SLOT if there is
+   * none.
    *
    * @param {number} frame Of the last cut.
    */

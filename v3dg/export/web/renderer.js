@@ -185,7 +185,7 @@ export class Renderer {
   }
 
   /**
-   * Let buffers have room for a number of gaussians.
+   * Enlarge the buffers, if necessary, for a number of gaussians.
    *
    * @param {number} count
    */

@@ -128,7 +128,7 @@ function readInstances(reader, list, names) {
     all.bundle[k] = bundle;
     all.positions.set(reader.numbers(row.position, `${place}.position`, 3), 3 * k);
     const quaternion = reader.numbers(row.quaternion ?? IDENTITY, `${place}.quaternion`, 4);
-    if (!quaternion.some(Boolean)) reader.refuse(`${place}.quaternion`, "a quaternion but zero");
+    if (!quaternion.some(Boolean)) reader.refuse(`${place}.quaternion`, "a nonzero quaternion");
     all.quaternions.set(quaternion, 4 * k);
     all.scales[k] = reader.positive(row.scale ?? 1, `${place}.scale`);
     all.importance[k] = reader.positive(row.importance ?? 1, `${place}.importance`);

@@ -1,7 +1,7 @@
 // Reads parts of a file from a static server by HTTP ranges. If the server has no
 // ranges, the whole file is read once.
 
-/** A state that the user should know, in one line. */
+/** An error that is reported to the user, in one line. */
 export class Problem extends Error {}
 
 /** A server or a network that does not answer. The read may be tried again. */
@@ -27,7 +27,7 @@ export class Source {
   size = -1;
   /** The whole file, if the server has no ranges. @type {Uint8Array} */
   whole = null;
-  /** What the server says about the version of the file. @type {string} */
+  /** The size of the file, and its ETag or its date of modification. @type {string} */
   version = null;
 
   /** @param {string} url Absolute. */
