@@ -194,8 +194,8 @@ class FilePages:
 
 
 class JoinedPages:
-    """Pages that are those of several bundles. They are read from there when they are
-    needed."""
+    """The pages of several other bundles, which are read from those bundles when they
+    are needed."""
 
     def __init__(
         self,
@@ -205,8 +205,8 @@ class JoinedPages:
         page: NDArray[np.int64],
     ) -> None:
         """Args:
-        source, page: (P,) for each page, the number of its source, and of the page
-            there.
+        source, page: (P,) for each page, the index of its source, and its index in that
+            source.
         """
         self.layout = layout
         self.codec: Codec = sources[0].codec

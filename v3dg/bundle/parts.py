@@ -1,5 +1,5 @@
-"""Parts of a bundle: some of its clusters as a bundle of their own, and bundles whose
-pages are those of several others."""
+"""Parts of a bundle: some of its clusters as a separate bundle, and bundles whose pages
+come from several others."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from v3dg.bundle.pages import JoinedPages, PageLayout
 
 @dataclass(frozen=True, eq=False)
 class BundlePart:
-    """Clusters of neighbouring levels of a bundle, with all others on the paths between
-    them, so that they form a bundle of their own.
+    """Clusters of neighbouring levels of a bundle, with all clusters on the paths
+    between them, so that they form a separate bundle.
 
     Attributes:
         clusters: (C,) indices of the clusters, ascending.
@@ -59,9 +59,9 @@ class BundlePart:
 
 @dataclass(frozen=True, eq=False)
 class ReplacedPart:
-    """A part of a bundle, and a bundle with the same tables but for the numbers of
-    gaussians and the boxes of clusters, which replaces the levels of the part from
-    `first_level` on, counted in the part."""
+    """A part of a bundle, and the bundle that replaces its levels from `first_level`
+    on. Levels are counted in the part. Both bundles have the same tables except for the
+    numbers of gaussians and the boxes of the clusters."""
 
     part: BundlePart
     bundle: Bundle
@@ -69,8 +69,8 @@ class ReplacedPart:
 
 
 def joined(bundle: Bundle, replaced: Iterable[ReplacedPart]) -> Bundle:
-    """Return a bundle with replaced parts. Its pages are read from the bundles that are
-    given when they are needed."""
+    """Return a bundle with replaced parts. It reads its pages from the bundles in the
+    arguments when they are needed."""
     sizes = np.diff(bundle.clusters.offset)
     box = bundle.clusters.box.copy()
     source = np.zeros(bundle.num_pages, np.int64)
@@ -167,8 +167,8 @@ def divided(bundle: Bundle, most_leaves: int) -> Division | None:
     return Division(units, _levels_from(bundle, first), top)
 
 
-# By how many levels the part above the units begins below them: in a build, a level is
-# fitted to the level six below it, too.
+# The part above the units begins at most this many levels below level `top`. A build
+# also fits a level to the level six below it.
 _LEVELS_BELOW = 6
 # A unit has at least levels 0 and 1, so that the part above it can begin with the
 # latter.

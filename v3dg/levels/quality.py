@@ -47,7 +47,8 @@ def refinement_of(
 
 def refined_settings(request: RefineRequest, bundle: Bundle, settings: JsonObject) -> JsonObject:
     """Return the config of a bundle that was built with these settings and then
-    refined. What follows from its gaussians, such as eyes, is as in the bundle."""
+    refined. Entries that follow from its gaussians, such as eyes, are those of the
+    bundle."""
     if bundle.num_levels < 2:
         return settings
     record = request.record()

@@ -2,10 +2,11 @@
 
 from v3dg.gaussians import gaussian_bytes
 
-# Largest number of gaussians of level 0 in a unit: few faces between units, and little
-# memory. The bits of a refined bundle depend on this number and on the next one.
+# Largest number of gaussians of level 0 in a unit: so many that there are few faces
+# between units, and so few that a unit needs little memory. The bits of a refined
+# bundle depend on this number and on the next one.
 UNIT_LEAVES = 1 << 22
-# Memory that a unit may take, of the host and of a GPU, in bytes.
+# Memory that a unit may take on the host, and again on a GPU, in bytes.
 _UNIT_BYTES = 10_000_000_000
 # A refinement needs memory for this many copies of all levels. All levels together have
 # about twice as many gaussians as the asset.
@@ -21,8 +22,8 @@ def most_leaves(sh_degree: int) -> int:
 
 
 def num_units(num_gaussians: int, sh_degree: int) -> int:
-    """Return in how many units an asset is refined. Each has half of the gaussians of a
-    larger subtree."""
+    """Return the number of units in which an asset is refined. Subtrees are halved
+    until they are small enough to be units."""
     units = 1
     while -(-num_gaussians // units) > most_leaves(sh_degree):
         units *= 2
@@ -35,8 +36,8 @@ def unit_leaves(num_gaussians: int, sh_degree: int) -> int:
 
 
 def refine_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Return the memory, in bytes, that the refinement of an asset needs: of the host,
-    and as much of a GPU."""
+    """Return the memory, in bytes, that the refinement of an asset needs on the host.
+    It needs as much again on a GPU."""
     return _bytes_of(unit_leaves(num_gaussians, sh_degree), sh_degree)
 
 

@@ -54,7 +54,8 @@ class RefineRequest:
     cameras: tuple[Camera, ...] = ()
 
     def num_pictures(self, device: Device) -> tuple[int, int]:
-        """Return how many pictures weigh gaussians, and how many move them."""
+        """Return the number of pictures that measure the weights of gaussians, and the
+        number of those by which gaussians move."""
         num_weighing = 0
         if self.drop > 0:
             num_weighing = _NUM_WEIGHING_PICTURES
@@ -62,7 +63,7 @@ class RefineRequest:
         return num_weighing, -(-self.steps // windows) * windows
 
     def record(self) -> JsonObject:
-        """Return what the config of a refined bundle says of this request."""
+        """Return the entries for this request in the config of a refined bundle."""
         record: JsonObject = {"steps": self.steps, "drop": self.drop, "seed": self.seed}
         if self.seen_from != "auto":
             record["seen_from"] = self.seen_from

@@ -45,7 +45,7 @@ def refined_bundle(
     """Return a bundle with refined levels; see `v3dg.refine_bundle`.
 
     Args:
-        devices: Devices of the same kind, which refine a unit each at a time.
+        devices: Devices of the same kind. Each refines one unit at a time.
         folder: Where finished units are stored, so that another call continues from
             them; None keeps them in memory. The result reads its pages from there.
     """
@@ -70,8 +70,8 @@ def refined_bundle(
 
 
 def _viewpoints(bundle: Bundle, request: RefineRequest) -> Viewpoints:
-    """Return from where pictures are taken: from the cameras of the request, or from
-    viewpoints of the bundle."""
+    """Return the viewpoints of the pictures: the cameras of the request, or viewpoints
+    that follow from the bundle."""
     if request.cameras:
         return Viewpoints(request.cameras)
     return viewpoints_of(bundle, request.seen_from)
@@ -242,8 +242,8 @@ class _MemoryStore:
 class _FolderStore:
     """Stores finished units as bundles in a folder.
 
-    The config of each says what it was made of. Units of other refinements are
-    replaced.
+    The config of each bundle identifies the input that it was made from. Units of other
+    refinements are replaced.
     """
 
     def __init__(self, folder: Path, identity: JsonObject) -> None:

@@ -38,8 +38,8 @@ from v3dg.levels.simplify import Level, LevelTables
 # the arrays that follow.
 _RECORD = struct.Struct("<II16s")
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
-# Names in the folder of refined units: a bundle for each unit, and what a killed
-# process has left of one.
+# Names in the folder of refined units: a bundle for each unit, and the incomplete files
+# of a killed process.
 _UNIT_NAME = re.compile(r"\d+\.v3dg|\.\d+\.v3dg\.[0-9a-f]+\.tmp")
 
 

@@ -49,8 +49,8 @@ _NEAR = 0.002
 # The share of what is seen from outside of a surrounding subject that is not its walls,
 # above which it is seen from outside, too.
 _LEAST_OUTER = 0.08
-# The share of the gaussians of a part of a subject that a camera must see to be one of
-# those for the part.
+# A camera is used for a part of a subject if it sees at least this share of the
+# gaussians of the part.
 _LEAST_SEEN = 0.05
 
 
