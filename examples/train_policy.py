@@ -62,8 +62,9 @@ class Config:
 
 class DriveToDonut(PictureVectorEnv):
     """A robot with a camera turns and drives; a red and a blue donut stand on the
-    ground. Reward is the approach to the red one, and 2 when it is reached; the blue
-    one costs 2. Either ends the episode."""
+    ground. The reward of a step is the decrease of the distance to the red one.
+    Reaching that adds 2, and reaching the blue one subtracts 2. Either ends the
+    episode."""
 
     def __init__(self, donut: v3dg.Bundle, config: Config) -> None:
         scene = v3dg.Scene()

@@ -196,9 +196,11 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
 def start_flush(descriptor: int, offset: int, num_bytes: int) -> None:
     """Make the system begin to write a part of a file to the disk, without waiting.
 
-    Otherwise Linux begins when much is waiting, and a flush at the end waits for it.
+    Otherwise Linux begins only when much data is waiting, and a flush at the end takes
+    long.
     """
-    # Linux also forgets what is on the disk already, which new data is not yet.
+    # On Linux this call also drops cached data that is already on the disk. New data is
+    # not on the disk yet, so it stays in the cache.
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(descriptor, offset, num_bytes, os.POSIX_FADV_DONTNEED)
 

@@ -397,7 +397,7 @@ def _forward(ctx: _Context, inputs: Sequence[torch.Tensor]) -> tuple[torch.Tenso
 def _gradients_of_set(
     ctx: _Context, number: int, planes: Sequence[torch.Tensor | None], wants: Sequence[bool]
 ) -> _core.Gradients:
-    """Run the backward pass of a set. `wants` contains whether gradients of the
+    """Run the backward pass of a set. `wants` has three flags: whether gradients of the
     centres, sums of their absolute values, and gradients of the poses are requested."""
     tape = ctx.tapes[number]
     d_color, d_alpha, d_depth = map(_to_core, planes)

@@ -211,8 +211,9 @@ class SplatCamera:
             shape_index_image: (V, H, W) uint32: the shape with the largest weight;
                 `NO_SHAPE` for instances that belong to no shape, and for meshes.
             normal_image: (V, H, W) vec3f in the world.
-            mesh: Meshes among the gaussians; on CUDA devices as far as
-                `Renderer.render_batch` supports them, as other channels than depth.
+            mesh: Meshes among the gaussians; on CUDA devices, meshes and the channels
+                other than depth are drawn as far as `Renderer.render_batch` supports
+                them.
 
         Returns:
             The pictures, NumPy arrays or torch tensors on the model's device.
@@ -399,8 +400,8 @@ def mesh_layer(
     shape_index_image: warp.array | None = None,
 ) -> MeshLayer:
     """Return pictures (V, H, W) of Newton's `SensorCamera` as meshes among gaussians.
-    Where it shows a gaussian of the model itself, hide that from it: its shape with
-    `is_visible=False` is drawn by `SplatCamera` only.
+    Hide the gaussians of the model from `SensorCamera`, so that they are not drawn
+    twice: a shape with `is_visible=False` is drawn by `SplatCamera` only.
 
     Args:
         color_image: uint32, with bytes in sRGB.
