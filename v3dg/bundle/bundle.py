@@ -262,6 +262,18 @@ class Bundle:
         first, last = np.searchsorted(self.clusters.level, [level, level + 1])
         return range(int(first), int(last))
 
+    def level_rows(self, level: int) -> slice:
+        """Return the rows of the gaussians of a level, among all gaussians."""
+        clusters = self.level_range(level)
+        first, last = self.clusters.offset[[clusters.start, clusters.stop]].tolist()
+        return slice(first, last)
+
+    @property
+    def num_leaves(self) -> int:
+        """Number of gaussians of level 0; 0 for a bundle without levels."""
+        end = np.searchsorted(self.clusters.level, 1)
+        return int(self.clusters.offset[end])
+
     def page_range(self, page: int) -> range:
         """Return the indices of the clusters in a page."""
         check_index("page", page, self.num_pages)

@@ -136,7 +136,7 @@ def divided(bundle: Bundle, most_leaves: int) -> Division | None:
         None for a bundle of at most `most_leaves`, and for one whose groups do not
         divide it into few such subtrees.
     """
-    num_leaves = _size_of_level(bundle, 0)
+    num_leaves = bundle.num_leaves
     if num_leaves <= most_leaves:
         return None
     groups = bundle.groups
@@ -180,9 +180,8 @@ _MOST_UNITS = 4
 
 def _size_of_level(bundle: Bundle, level: int) -> int:
     """Return the number of gaussians of a level."""
-    clusters = bundle.level_range(level)
-    first, last = bundle.clusters.offset[[clusters.start, clusters.stop]].tolist()
-    return int(last - first)
+    rows = bundle.level_rows(level)
+    return int(rows.stop - rows.start)
 
 
 def _leaves_of_groups(bundle: Bundle) -> NDArray[np.int64]:

@@ -110,7 +110,7 @@ def write_web_page(
         write_scene(new.path / SCENE, scene, names, cameras)
         _write_viewer(new.path)
         num_bytes = _common.bytes_below(new.path)
-    finest = [int(bundle.clusters.offset[_end_of_leaves(bundle)]) for bundle in scene.bundles]
+    finest = [bundle.num_leaves for bundle in scene.bundles]
     gaussians = sum(finest[index] for index in scene.instance_bundle.tolist())
     return WebPage(len(names), len(scene), gaussians, num_bytes)
 
@@ -123,11 +123,6 @@ def _check_core() -> None:
         "was built; install a wheel of a release, run pip install ziglang and build v3dg again, "
         "or export for another engine (--to sog)"
     )
-
-
-def _end_of_leaves(bundle: Bundle) -> int:
-    """Return the number of clusters of level 0, which come first."""
-    return int((bundle.clusters.level == 0).sum())
 
 
 def _write_bundle(bundle: Bundle, path: Path) -> None:

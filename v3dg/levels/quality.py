@@ -71,8 +71,7 @@ def pictures_of(quality: Literal["standard", "best"], num_gaussians: int, sh_deg
 def estimated_seconds(bundle: Bundle, device: Device) -> float:
     """Return about how long a standard refinement of a bundle takes on a device, from
     the first pictures of one, or of its first unit."""
-    num_leaves = int(bundle.clusters.offset[bundle.level_range(0).stop])
-    pictures = pictures_of("standard", num_leaves, bundle.sh_degree)
+    pictures = pictures_of("standard", bundle.num_leaves, bundle.sh_degree)
     division = divided(bundle, most_leaves(bundle.sh_degree))
     if division is not None:
         bundle = division.units[0].of(bundle)

@@ -189,7 +189,7 @@ class Cuts:
         self._device = device
         self._progress = progress
         everything = bundle.gaussians
-        self._leaves = slice(0, int(bundle.clusters.offset[bundle.level_range(0).stop]))
+        self._leaves = bundle.level_rows(0)
         self._gaussians = _device.place(everything.subset(np.arange(len(everything))), device)
         self._pictures = _core.CutPictures(
             table=residency.table(bundle),
@@ -275,8 +275,7 @@ def _without_least(
     offset = bundle.clusters.offset
     is_kept = np.ones(bundle.num_gaussians, bool)
     for level in range(first_level, bundle.num_levels):
-        clusters_of_level = bundle.level_range(level)
-        rows = slice(offset[clusters_of_level.start], offset[clusters_of_level.stop])
+        rows = bundle.level_rows(level)
         order = np.argsort(weight[rows], kind="stable")
         cumulated = np.cumsum(weight[rows][order])
         is_kept[rows][order[cumulated < share * np.nansum(weight[rows])]] = False

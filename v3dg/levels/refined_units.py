@@ -49,7 +49,7 @@ def refined_bundle(
         folder: Where finished units are stored, so that another call continues from
             them; None keeps them in memory. The result reads its pages from there.
     """
-    if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
+    if bundle.num_levels < 2 or bundle.num_leaves == 0:
         return bundle
     limit = most_leaves(bundle.sh_degree)
     division = divided(bundle, limit)

@@ -207,9 +207,7 @@ class SceneView:
         self.center, self.radius = _bounds(self.scene)
         self.near = min(0.01, 1e-3 * self.radius)
         self.num_levels = max((bundle.num_levels for bundle in self.scene.bundles), default=1)
-        sizes = [
-            bundle.clusters.offset[bundle.level_range(0).stop] for bundle in self.scene.bundles
-        ]
+        sizes = [bundle.num_leaves for bundle in self.scene.bundles]
         self.num_gaussians = int(np.array(sizes, np.int64)[self.scene.instance_bundle].sum())
 
     @functools.cached_property
