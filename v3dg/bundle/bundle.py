@@ -26,6 +26,7 @@ from v3dg.bundle.pages import (
     Pages,
     on_threads,
     runs_of_pages,
+    runs_that_follow,
 )
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
@@ -357,11 +358,9 @@ class Bundle:
 
     def pages_gaussians(self, pages: NDArray[np.int64]) -> Gaussians:
         """Return the gaussians of some pages, in the order of the pages."""
-        starts = np.flatnonzero(np.diff(pages, prepend=-2) != 1)
-        ends = [*starts[1:].tolist(), len(pages)]
         pieces = [
-            self._pages.read(int(pages[start]), int(pages[end - 1]) + 1)
-            for start, end in zip(starts.tolist(), ends, strict=True)
+            self._pages.read(int(pages[run.start]), int(pages[run.stop - 1]) + 1)
+            for run in runs_that_follow(np.diff(pages) == 1)
         ]
         return Gaussians.concatenate(pieces)
 

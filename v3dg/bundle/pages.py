@@ -219,10 +219,9 @@ class JoinedPages:
         source = self._source[first_page:last_page]
         page = self._page[first_page:last_page]
         follows = (np.diff(source) == 0) & (np.diff(page) == 1)
-        starts = [0, *(np.flatnonzero(~follows) + 1).tolist()]
         pieces: list[Gaussians] = [
-            self._sources[source[start]].read(int(page[start]), int(page[end - 1]) + 1)
-            for start, end in itertools.pairwise([*starts, len(page)])
+            self._sources[source[run.start]].read(int(page[run.start]), int(page[run.stop - 1]) + 1)
+            for run in runs_that_follow(follows)
         ]
         if len(pieces) == 1:
             return pieces[0]
@@ -248,6 +247,14 @@ def on_threads(
         return list(map(work, items))
     with ThreadPoolExecutor(max_threads) as pool:
         return list(pool.map(work, items))
+
+
+def runs_that_follow(follows: NDArray[np.bool_]) -> Iterator[range]:
+    """Yield the runs of N items in which each item follows the one before it. `follows`
+    has N - 1 flags, of the items after the first."""
+    starts = [0, *(np.flatnonzero(~follows) + 1).tolist()]
+    for start, stop in itertools.pairwise([*starts, len(follows) + 1]):
+        yield range(start, stop)
 
 
 def runs_of_pages(

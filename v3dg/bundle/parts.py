@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg.bundle.bundle import Bundle
+from v3dg.bundle.format import offset_of
 from v3dg.bundle.pages import JoinedPages, PageLayout
 
 
@@ -37,7 +38,7 @@ class BundlePart:
         number[self.groups] = np.arange(len(self.groups), dtype=np.int32)
         part_clusters = replace(
             clusters,
-            offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)]),
+            offset=offset_of(sizes),
             level=clusters.level[self.clusters] - np.int32(self.first_level),
             own_group=number[clusters.own_group[self.clusters]],
             parent_group=number[clusters.parent_group[self.clusters]],
@@ -85,8 +86,7 @@ def joined(bundle: Bundle, replaced: Iterable[ReplacedPart]) -> Bundle:
         source[pages] = len(bundles)
         page[pages] = new.bundle.pages_of(np.flatnonzero(is_new))
         bundles.append(new.bundle)
-    offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
-    clusters_of_all = replace(bundle.clusters, offset=offset, box=box)
+    clusters_of_all = replace(bundle.clusters, offset=offset_of(sizes), box=box)
     pages_of_all = JoinedPages(
         PageLayout.of(clusters_of_all), [part.pages for part in bundles], source, page
     )
