@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias, cast, overload
 
@@ -125,9 +125,6 @@ class ScanBatch(Sequence[Scan]):
             alpha=self.alpha[number],
             gaussians=self.gaussians[number],
         )
-
-    def __iter__(self) -> Iterator[Scan]:
-        return (self[number] for number in range(len(self)))
 
 
 @overload
