@@ -4,12 +4,13 @@ documents."""
 import copy
 import json
 import math
+import os
 import re
 import warnings
 from collections.abc import Collection, Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,10 @@ from numpy.typing import NDArray
 from v3dg import _core
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
-from v3dg.cameras import Axis, Floats
+from v3dg.cameras import Axis, Camera, Floats, check_cameras
+from v3dg.export._folder import check_outside
 from v3dg.formats import _axes
+from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Scene
 
 _MIN_OPACITY = float(np.float32(_core.min_alpha))
@@ -41,6 +44,26 @@ def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
     """Return the (3, 3) rotation that maps the up axis of a world to the up axis of a
     format."""
     return _axes.turn(_axes.axes_of_up(up), _WORLDS[frame])
+
+
+def opened_with_cameras(
+    subject: Scene | Bundle | File, folder: Path, cameras: Mapping[str, Camera] | None
+) -> tuple[Scene | Bundle, Mapping[str, Camera]]:
+    """Return the subject of an export to a folder and its cameras: the named ones, else
+    those of the subject's file.
+
+    Raises:
+        TypeError: `cameras` is not a mapping from names to cameras.
+        ValueError: The folder contains the file of the subject.
+    """
+    content: object = subject
+    if isinstance(subject, str | os.PathLike):
+        check_outside(folder, [subject])
+        content, file_cameras = open_with_cameras(Path(subject))
+        cameras = cameras or file_cameras
+    cameras = cameras or {}
+    check_cameras(cameras)
+    return cast(Scene | Bundle, content), cameras
 
 
 def exported(scene: Scene, format_name: str) -> Scene:

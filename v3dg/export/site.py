@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,14 +19,14 @@ from v3dg import _files
 from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg.bundle import Bundle
-from v3dg.cameras import Axis, Camera, Floats, check_cameras
+from v3dg.cameras import Axis, Camera, Floats
 from v3dg.export import _common
-from v3dg.export._folder import NewFiles, check_outside, replacing_export
+from v3dg.export._folder import NewFiles, replacing_export
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, SETTINGS, Export, Plan, write_levels
 from v3dg.framing import frame_subject
-from v3dg.opening import File, open_with_cameras
+from v3dg.opening import File
 from v3dg.rotations import turn_upright
-from v3dg.scene import Scene, Subject
+from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.upright import direction_of, up_of
 
@@ -99,17 +99,11 @@ def write_site(
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
-    content: object = subject
-    if isinstance(subject, str | os.PathLike):
-        check_outside(Path(folder), [subject])
-        content, file_cameras = open_with_cameras(Path(subject))
-        cameras = cameras or file_cameras
-    cameras = cameras or {}
-    check_cameras(cameras)
-    scene = Scene.of(cast(Scene | Bundle, content))  # rejects anything else
+    content, cameras = _common.opened_with_cameras(subject, Path(folder), cameras)
+    scene = Scene.of(content)  # rejects anything else
     scene = _common.exported(scene, "the web page")
     is_scene = isinstance(content, Scene)
-    axes = _axes(up or up_of(cast(Subject, content), cameras)[0], is_scene=is_scene)
+    axes = _axes(up or up_of(content, cameras)[0], is_scene=is_scene)
     turn = turn_upright(axes.asset)
     check("scene", len(scene), "at least one instance to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]

@@ -15,12 +15,12 @@ from v3dg._progress import Bar, Progress
 from v3dg._urls import is_url
 from v3dg.bundle import Bundle
 from v3dg.bundle.codec import Quantized
-from v3dg.cameras import Axis, Camera, check_cameras
+from v3dg.cameras import Axis, Camera
 from v3dg.export import _common
-from v3dg.export._folder import check_outside, replacing_export
+from v3dg.export._folder import replacing_export
 from v3dg.framing import frame_subject
-from v3dg.opening import File, open_with_cameras
-from v3dg.scene import Scene, Subject
+from v3dg.opening import File
+from v3dg.scene import Scene
 from v3dg.scene.file import write_scene
 from v3dg.upright import direction_of, up_of
 
@@ -87,16 +87,10 @@ def write_web_page(
         OSError: A file cannot be written.
     """
     _check_core()
-    content: object = subject
-    if isinstance(subject, str | os.PathLike):
-        check_outside(Path(folder), [subject])
-        content, file_cameras = open_with_cameras(Path(subject))
-        cameras = cameras or file_cameras
-    cameras = cameras or {}
-    check_cameras(cameras)
-    scene = copy.copy(Scene.of(cast(Scene | Bundle, content)))
+    content, cameras = _common.opened_with_cameras(subject, Path(folder), cameras)
+    scene = copy.copy(Scene.of(content))
     check("scene", len(scene), "at least one instance to export, got none")
-    axis = up or up_of(cast(Subject, content), cameras)[0]
+    axis = up or up_of(content, cameras)[0]
     scene.up = axis
     if not cameras:
         framing = frame_subject(scene)
