@@ -12,11 +12,11 @@ from v3dg._numbers import color as color_of
 from v3dg.gaussians import TRAINED_FILTER_PX2, Gaussians
 from v3dg.image import Image
 from v3dg.render.asset_frame import check_request
-from v3dg.residency import ResidentScene, residency
+from v3dg.render.resident_frame import ResidentFrame
+from v3dg.residency import residency
 from v3dg.spherical import MIN_TRANSMITTANCE, EquirectangularCamera
 
 if TYPE_CHECKING:
-    import weakref
     from collections.abc import Sequence
 
     from v3dg._device import Device
@@ -40,16 +40,16 @@ class RayImage(Image):
         self.gaussians = gaussians
 
 
-class RayFrame:
+class RayFrame(ResidentFrame):
     """Casts rays through a scene or a bundle on one device, with buffers that are
     reused from cast to cast. It does not keep the subject alive."""
 
     def __init__(self, device: Device) -> None:
+        super().__init__(device)
         self._core = _core.RayFrame(device.number)
-        self._device = device
-        self._num_bundles = 0
-        self._references: tuple[weakref.ref[Bundle], ...] | None = None
-        self._resident: ResidentScene | None = None  # the scene of the last cast
+
+    def _set_models(self, bundles: Sequence[Bundle]) -> None:
+        self._core.set_models([residency.model(bundle, self.device) for bundle in bundles])
 
     def cast(
         self,
@@ -60,22 +60,9 @@ class RayFrame:
         returns: tuple[float, float] | None,
     ) -> _core.Cast:
         """Cast the rays of a sensor at each of B poses; see `cast_rays`."""
-        with residency.turn(self._device):
-            resident = residency.scene(subject, self._device, self._resident)
-            self._resident = resident
-            self._take(resident)
+        with residency.turn(self.device):
+            resident = self._taken(subject)
             return self._core.cast_scene(resident.core, sensor, viewmats, cut.rule, returns)
-
-    def _take(self, resident: ResidentScene) -> None:
-        """Put the gaussians of the scene's bundles on the device."""
-        if self._references is resident.references:
-            return
-        with residency.lock:
-            bundles = resident.bundles
-            if self._num_bundles < len(bundles):
-                self._core.set_models([residency.model(b, self._device) for b in bundles])
-                self._num_bundles = len(bundles)
-            self._references = resident.references
 
 
 def check_rays(

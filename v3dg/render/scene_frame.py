@@ -15,47 +15,34 @@ from v3dg.image import RenderedImage, Stats
 from v3dg.render.batch import BatchRequest, RenderedBatch, draw_batch
 from v3dg.render.picture import Picture, picture_of, stats_of
 from v3dg.render.request import CutRequest, FrameRequest
+from v3dg.render.resident_frame import ResidentFrame
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import Selection, over_budget
 
 if TYPE_CHECKING:
-    import weakref
+    from collections.abc import Sequence
 
     from v3dg.scene import Subject
 
 
-class SceneFrame:
+class SceneFrame(ResidentFrame):
     """Draws a scene or a bundle on one device, where all its gaussians are resident.
 
     It does not keep the subject alive.
 
     Attributes:
-        device: The device that draws.
         memory: None, because this frame has no pool.
-        num_bundles: Number of the scene's bundles whose gaussians are on the device. A
-            scene never removes bundles.
     """
 
     def __init__(self, color_by: ColorBy, device: Device) -> None:
-        self.device = device
+        super().__init__(device)
         self.memory: int | None = None
-        self.num_bundles = 0
         self.core = _core.SceneFrame(device.number)
         self._color_by = color_by
-        self._references: tuple[weakref.ref[Bundle], ...] | None = None
-        self._resident: ResidentScene | None = None  # the scene as it was last drawn
 
-    def take(self, resident: ResidentScene) -> None:
-        """Put the gaussians of the scene's bundles on the device."""
-        if self._references is resident.references:  # true for most pictures
-            return
-        with residency.lock:
-            bundles = resident.bundles
-            if self.num_bundles < len(bundles):
-                residency.set_models(self.core, bundles, self.device, self._color_by)
-                self.num_bundles = len(bundles)
-            self._references = resident.references
+    def _set_models(self, bundles: Sequence[Bundle]) -> None:
+        residency.set_models(self.core, bundles, self.device, self._color_by)
 
     def chosen(self, subject: Subject) -> SceneFrame:
         """Return this frame."""
@@ -79,9 +66,7 @@ class SceneFrame:
             return self._draw_given(subject, request, selection, camera, stop)
         rule = cut.rule
         with residency.turn(self.device):
-            resident = residency.scene(subject, self.device, self._resident)
-            self._resident = resident
-            self.take(resident)
+            resident = self._taken(subject)
             core_request = _core.FrameRequest(camera.core, rule, shade, None, None, sensor)
             drawing = self.core.draw(resident.core, core_request, None, steps, stop)
             resident.add_drawing(drawing)
@@ -103,9 +88,7 @@ class SceneFrame:
     def draw_batch(self, subject: Subject, request: BatchRequest) -> RenderedBatch:
         """Draw a picture for each camera of a batch."""
         with residency.turn(self.device):
-            resident = residency.scene(subject, self.device, self._resident)
-            self._resident = resident
-            self.take(resident)
+            resident = self._taken(subject)
             return draw_batch(self.core, resident, self.device, request)
 
     def settle(
@@ -123,9 +106,7 @@ class SceneFrame:
     ) -> RenderedImage:
         """Draw a cut that was selected earlier."""
         with residency.turn(self.device):
-            resident = residency.scene(subject, self.device, self._resident)
-            self._resident = resident
-            self.take(resident)
+            resident = self._taken(subject)
             _check_cut(cut, subject, resident, request.cut)
             weights = None
             if cut.given_weights is not None:
