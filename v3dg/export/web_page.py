@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from v3dg import _files
 from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
@@ -105,7 +107,7 @@ def write_web_page(
         _write_viewer(new.path)
         num_bytes = _common.bytes_below(new.path)
     finest = [bundle.num_leaves for bundle in scene.bundles]
-    gaussians = sum(finest[index] for index in scene.instance_bundle.tolist())
+    gaussians = int(np.array(finest, np.int64)[scene.instance_bundle].sum())
     return WebPage(len(names), len(scene), gaussians, num_bytes)
 
 
