@@ -23,6 +23,8 @@ def opengl_here():
 os.environ.setdefault("MUJOCO_GL", opengl_here())
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed")
 
+import OpenGL.error  # noqa: E402
+
 from v3dg.simulators.mujoco import (  # noqa: E402
     FIRST_GEOM,
     Attachments,
@@ -75,10 +77,12 @@ def data(model):
 
 @pytest.fixture(scope="module")
 def drawable(model):
-    """The model, if MuJoCo can draw here."""
+    """The model, if MuJoCo has a library and a context of OpenGL here."""
+    if not hasattr(mujoco, "GLContext"):
+        pytest.skip("MuJoCo cannot draw here: it has no library for OpenGL")
     try:
-        mujoco.Renderer(model, 8, 8).close()
-    except Exception as error:
+        mujoco.GLContext(8, 8).free()
+    except (ImportError, RuntimeError, OpenGL.error.Error) as error:
         pytest.skip(f"MuJoCo cannot draw here: {error}")
     return model
 
