@@ -17,6 +17,7 @@ from v3dg.cameras import Camera, rigid
 from v3dg.render import MeshLayer, Renderer
 from v3dg.rotations import product, rotation_from_quaternion
 from v3dg.scene import Scene
+from v3dg.simulators._instances import free_ids
 
 try:
     import mujoco
@@ -197,11 +198,7 @@ class Attachments:
             ValueError: There is no such body or instance, or an instance is attached
                 already.
         """
-        ids = np.atleast_1d(np.asarray(instances)).astype(np.int64)
-        is_known = bool(((ids >= 0) & (ids < len(self.scene))).all())
-        check("instances", is_known, f"ids from 0 to {len(self.scene) - 1}, got {ids.tolist()}")
-        is_free = not np.isin(ids, self._instances).any()
-        check("instances", is_free, f"instances without a body, got {ids.tolist()}")
+        ids = free_ids(instances, self.scene, self._instances)
         number = _id_of(self._model, mujoco.mjtObj.mjOBJ_BODY, body, "body", 0)
         turn = vector(quaternion, "quaternion", (4,))
         check("quaternion", turn.any(), "a rotation, got zeros")

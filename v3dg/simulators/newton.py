@@ -14,6 +14,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels import BuildConfig, build_bundle
 from v3dg.render import MeshLayer, RenderedBatch, Renderer
 from v3dg.scene import Scene
+from v3dg.simulators._instances import free_ids
 from v3dg.simulators._poses import product_of, rotations_of, write_viewmats
 
 try:
@@ -165,11 +166,7 @@ class SplatCamera:
             ValueError: There is no such body or instance, or an instance is attached
                 already.
         """
-        ids = np.atleast_1d(np.asarray(instances)).astype(np.int64)
-        is_known = bool(((ids >= 0) & (ids < len(self.scene))).all())
-        check("instances", is_known, f"ids from 0 to {len(self.scene) - 1}, got {ids.tolist()}")
-        is_free = not np.isin(ids, self._instances).any()
-        check("instances", is_free, f"instances without a body, got {ids.tolist()}")
+        ids = free_ids(instances, self.scene, self._instances)
         count = len(ids)
         numbers = np.broadcast_to(np.asarray(bodies, np.int64), count)
         last = self._model.body_count - 1
