@@ -12,6 +12,7 @@ from v3dg._numbers import check_type, floats, whole
 from v3dg.camera_batch import CameraBatch
 from v3dg.render import BatchPlanes, Renderer
 from v3dg.scene import Scene
+from v3dg.simulators._colors import bytes_of
 
 try:
     import gymnasium
@@ -197,5 +198,4 @@ class PictureVectorEnv(VectorEnv):
         pictures = self._renderer.render_batch(
             cameras, background=self._background, tolerance=self._tolerance, out=self._planes
         )
-        color = torch.as_tensor(pictures.color)
-        return (color.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        return bytes_of(torch.as_tensor(pictures.color))

@@ -21,6 +21,7 @@ from v3dg.camera_batch import CameraBatch
 from v3dg.gaussians import Gaussians
 from v3dg.render import RenderedBatch, Renderer
 from v3dg.scene import Scene
+from v3dg.simulators._colors import rgba_of
 from v3dg.simulators._poses import rotations_of, write_viewmats
 
 try:
@@ -265,10 +266,7 @@ class SplatRenderer(BaseRenderer):
         import torch
 
         if kind in _COLORS:
-            color = torch.as_tensor(pictures.color)[..., :3]
-            alpha = torch.as_tensor(pictures.alpha)[..., None]
-            values = torch.cat([color, alpha], dim=-1)[..., : _COLORS[kind]]
-            return (values.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+            return rgba_of(pictures)[..., : _COLORS[kind]]
         channel = _CHANNELS[kind]
         if channel == "normal":
             in_view = torch.as_tensor(pictures.normal)

@@ -14,6 +14,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels import BuildConfig, build_bundle
 from v3dg.render import MeshLayer, RenderedBatch, Renderer
 from v3dg.scene import Scene
+from v3dg.simulators._colors import rgba_of
 from v3dg.simulators._instances import free_ids
 from v3dg.simulators._poses import product_of, rotations_of, write_viewmats
 
@@ -369,9 +370,7 @@ def _packed(pictures: RenderedBatch) -> torch.Tensor:
     """Return colours (V, H, W), red in the lowest byte and coverage in the highest."""
     import torch
 
-    color = torch.as_tensor(pictures.color)[..., :3]
-    alpha = torch.as_tensor(pictures.alpha)[..., None]
-    values = (torch.cat([color, alpha], dim=-1).clamp(0, 1) * 255 + 0.5).long()
+    values = rgba_of(pictures).long()
     factors = torch.tensor([1, 1 << 8, 1 << 16, 1 << 24], device=values.device)
     return (values * factors).sum(dim=-1)
 
