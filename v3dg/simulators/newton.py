@@ -119,18 +119,19 @@ class SplatCamera:
         self._instances: list[int] = []
         self._bodies: list[int] = []
         self._offsets: list[npt.NDArray[np.float32]] = []  # x y z, and x y z w
-        self._shapes: list[int] = []  # of instances
         self._tensors: _Attached | None = None
-        self._add_shapes(config)
+        self._shapes = self._add_shapes(config)  # of instances
         self._renderer: Renderer | None = None
 
-    def _add_shapes(self, config: BuildConfig | None) -> None:
-        """Add the gaussians of the model to the scene."""
+    def _add_shapes(self, config: BuildConfig | None) -> list[int]:
+        """Add the gaussians of the model to the scene; return their shapes."""
         model = self._model
         bundles: dict[int, Bundle] = {}
         types = model.shape_type.numpy()
         scales = model.shape_scale.numpy()
-        for shape in np.flatnonzero(types == int(newton.GeoType.GAUSSIAN)).tolist():
+        worlds = model.shape_world.numpy()
+        shapes: list[int] = np.flatnonzero(types == int(newton.GeoType.GAUSSIAN)).tolist()
+        for shape in shapes:
             source = model.shape_source[shape]
             if id(source) not in bundles:
                 bundles[id(source)] = build_bundle(
@@ -139,15 +140,16 @@ class SplatCamera:
             scale = scales[shape]
             name = f"model.shape_scale[{shape}]"
             check(name, np.ptp(scale) == 0 < scale[0], f"a uniform scale, got {scale.tolist()}")
-            ids = self.scene.add(
+            self.scene.add(
                 bundles[id(source)],
                 np.zeros(3),
                 scales=float(scale[0]),
-                environment=int(model.shape_world.numpy()[shape]),
+                environment=int(worlds[shape]),
             )
-            transform = model.shape_transform.numpy()[shape]
-            self.attach(ids, [int(model.shape_body.numpy()[shape])], transform)
-            self._shapes.append(shape)
+        bodies = model.shape_body.numpy()[shapes]
+        transforms = model.shape_transform.numpy()[shapes]
+        self.attach(np.arange(len(shapes)), bodies, transforms)
+        return shapes
 
     def attach(
         self,
@@ -227,7 +229,9 @@ class SplatCamera:
                 "instance": (shape_index_image,),
                 "normal": (normal_image,),
             }
-            channels = [name for name, used in images.items() if used.count(None) < len(used)]
+            channels = [
+                name for name, used in images.items() if any(image is not None for image in used)
+            ]
             pictures = self._draw(cameras, channels, mesh)
             if color_image is not None:
                 _write(color_image, "color_image", _packed(pictures))
