@@ -1,27 +1,6 @@
 // Draws the records from back to front as quads, and finishes the picture. The falloff
 // is that of csrc/rasterize/rasterize_math.h.
 
-struct Camera {
-  focal: vec2f,
-  center: vec2f,
-  size: vec2f,  // px
-  near: f32,
-  count: u32,
-  lowest_slope: vec2f,
-  highest_slope: vec2f,
-  background: vec4f,
-}
-
-struct Record {
-  center: vec2f,  // px
-  l11: f32,
-  l12: f32,
-  l22: f32,
-  log2_opacity: f32,
-  red_green: u32,  // halves
-  blue: u32,
-}
-
 struct DrawArguments {
   num_vertices: u32,
   num_instances: u32,
@@ -36,7 +15,6 @@ struct Corner {
   @location(2) @interpolate(flat) color: vec3f,
 }
 
-const kLog2MinAlpha = -7.994353436858858;
 const kMaxAlpha = 0.999;
 // Devices round the corners of quads to a fraction of a pixel.
 const kMargin_px = 0.02;

@@ -2,17 +2,6 @@
 // gaussian. The formulas are those of csrc/quantize/quantize_math.h,
 // csrc/project/project_math.h and csrc/math/sh.h, which explain them.
 
-struct Camera {
-  focal: vec2f,  // px
-  center: vec2f,  // px
-  size: vec2f,  // px
-  near: f32,
-  count: u32,  // gaussians of the cut
-  lowest_slope: vec2f,
-  highest_slope: vec2f,
-  background: vec4f,
-}
-
 // An instance in front of the camera. A point p of the instance is at
 // linear (p - eye) + translation.
 struct Placement {
@@ -36,18 +25,6 @@ struct Pair {
   weight: f32,
 }
 
-// A gaussian in the picture. At offset d from the centre, alpha is
-// 2^(log2_opacity - |L d|^2) with L = [[l11, l12], [0, l22]].
-struct Record {
-  center: vec2f,  // px
-  l11: f32,
-  l12: f32,
-  l22: f32,
-  log2_opacity: f32,
-  red_green: u32,  // halves
-  blue: u32,
-}
-
 struct DrawArguments {
   num_vertices: u32,
   num_instances: atomic<u32>,
@@ -61,7 +38,6 @@ const kLimited = 2u;
 const kDegreeShift = 4u;
 
 const kMinAlpha = 0.00392156862745098;
-const kLog2MinAlpha = -7.994353436858858;
 const kFalloffScale = 0.8493218002880191;
 const kMostFilterOfVariance = 4.0;
 const kLargest = 3.4028234e38;

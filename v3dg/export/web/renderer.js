@@ -72,11 +72,15 @@ export class Renderer {
    */
   static async create(canvas, poolBytes) {
     const device = await requestDevice();
-    const names = ["project.wgsl", "sort.wgsl", "draw.wgsl"];
-    const texts = await Promise.all(names.map(shaderText));
-    const [project, sort, draw] = texts.map((code) => device.createShaderModule({ code }));
+    const names = ["shared.wgsl", "project.wgsl", "sort.wgsl", "draw.wgsl"];
+    const [shared, project, sort, draw] = await Promise.all(names.map(shaderText));
+    const compiled = (/** @type {string} */ code) => device.createShaderModule({ code });
     const renderer = new Renderer(device, canvas, poolBytes);
-    await renderer.makePipelines(project, sort, draw);
+    await renderer.makePipelines(
+      compiled(shared + project),
+      compiled(sort),
+      compiled(shared + draw),
+    );
     return renderer;
   }
 
