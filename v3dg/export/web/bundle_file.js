@@ -82,9 +82,9 @@ export class BundleFile {
    * @param {() => Promise<Core>} newCore Makes a core, which a failed check ends.
    */
   static async open(source, newCore) {
-    const { header, degree, version, dataStart } = await readHeader(source);
-    const file = new BundleFile(source, degree, dataStart);
-    await file.readTables(header, version, newCore);
+    const { head, header, degree, version } = await readHeader(source);
+    const file = new BundleFile(source, degree, head.length);
+    await file.readTables(head, header, version, newCore);
     return file;
   }
 
@@ -152,11 +152,12 @@ export class BundleFile {
   }
 
   /**
-   * @param {Header} header
+   * @param {Uint8Array} head The bytes before the pages.
+   * @param {Header} header What they say.
    * @param {string} version
    * @param {() => Promise<Core>} newCore
    */
-  async readTables(header, version, newCore) {
+  async readTables(head, header, version, newCore) {
     const { source, dataStart } = this;
     const [pagesBytes] = header.pages?.shape ?? [];
     const places = placesOf(header, pagesBytes);
@@ -171,7 +172,6 @@ export class BundleFile {
     if (end - start > MOST_TABLE_BYTES) {
       throw this.problem(`expected tables of at most ${MOST_TABLE_BYTES} bytes`);
     }
-    const head = await source.read(0, dataStart);
     const bytes = await source.read(start, end);
     const core = await newCore();
     if (!isHashed(core, version, head, bytes)) {
@@ -275,9 +275,10 @@ async function readHeader(source) {
   if (length > MOST_HEADER_BYTES) throw refuse("a v3dg bundle");
   const dataStart = 8 + Number(length);
   if (bytes.length < dataStart) bytes = await source.read(0, dataStart);
+  const head = bytes.subarray(0, dataStart);
   let header;
   try {
-    header = JSON.parse(textOf(bytes.subarray(8, dataStart)));
+    header = JSON.parse(textOf(head.subarray(8)));
   } catch {
     throw refuse("a v3dg bundle");
   }
@@ -287,7 +288,7 @@ async function readHeader(source) {
   if (codec !== "quantized") throw refuse("a bundle with the codec quantized");
   if (!VERSIONS.includes(version)) throw refuse(`version ${VERSIONS.join(" or ")} of the format`);
   if (!["0", "1", "2", "3"].includes(degree)) throw refuse("spherical harmonics of degree 0 to 3");
-  return { header, version, degree: Number(degree), dataStart };
+  return { head, header, version, degree: Number(degree) };
 }
 
 /** @param {unknown} number */
