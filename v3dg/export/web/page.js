@@ -2,6 +2,7 @@
 
 import { AXES, Camera, isMode } from "./camera.js";
 import * as M from "./math.js";
+import { eyeOf } from "./placement.js";
 import { open } from "./viewer.js";
 
 /** @typedef {import("./scene_file.js").NamedCamera} NamedCamera */
@@ -72,7 +73,7 @@ class Page {
     camera.radius = radius;
     camera.up = AXES[viewer.up ?? "-y"];
     this.near = NEAR_SHARE * radius;
-    const away = M.unit(M.add(M.mul(M.axisAcross(camera.up), 1), M.mul(camera.up, 0.35)));
+    const away = M.unit(M.add(M.axisAcross(camera.up), M.mul(camera.up, 0.35)));
     camera.focus = [x, y, z];
     camera.position = M.add(camera.focus, M.mul(away, 1.6 * radius));
     camera.wxyz = M.looking(M.mul(away, -1), camera.up);
@@ -120,11 +121,7 @@ class Page {
   lookThrough({ viewmat, k, width, height, near }) {
     const rows = [0, 1, 2].map((row) => Array.from(viewmat).slice(4 * row, 4 * row + 3));
     const wxyz = M.unit(M.fromAxes(rows[0], rows[1], rows[2]));
-    const shift = [0, 1, 2].map((row) => viewmat[4 * row + 3]);
-    const position = M.mul(
-      [0, 1, 2].map((a) => rows.reduce((sum, row, j) => sum + row[a] * shift[j], 0)),
-      -1,
-    );
+    const position = eyeOf(viewmat);
     this.near = near;
     // put() moves the focus ahead of the camera, at this distance.
     this.camera.position = position;
