@@ -123,8 +123,8 @@ export class PagePool {
   }
 
   /**
-   * Store which pages of a bundle the cut of a frame needs. Returns the absent pages,
-   * those above before those below.
+   * Store which pages of a bundle the cut of a frame needs. Returns the absent pages. The
+   * priority of a page is higher than those of the pages below it.
    *
    * @param {number} bundle
    * @param {Float32Array} needs Priority of each page; 0 if it is not needed.
@@ -147,7 +147,7 @@ export class PagePool {
         priority *= ABOVE;
       }
     });
-    return [...wanted.values()].toSorted((a, b) => b.priority - a.priority);
+    return [...wanted.values()];
   }
 
   /**
