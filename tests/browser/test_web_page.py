@@ -1,30 +1,19 @@
 """The page of `write_web_page` streams a scene and draws it as `v3dg.render` does. See
 test_web_renderer.py for what the tests need."""
 
-import importlib.util
 import json
 import time
 
 import numpy as np
 import pytest
 
-import chromium
 import scenes_lod
 import v3dg
 import web_pages
 from v3dg.metrics import psnr
 from web_server import serving
 
-pytestmark = [
-    pytest.mark.skipif(chromium.PROGRAM is None, reason="chromium is not installed"),
-    pytest.mark.skipif(
-        importlib.util.find_spec("playwright") is None, reason="playwright is not installed"
-    ),
-    pytest.mark.skipif(
-        not (web_pages.WEB / "core.wasm").is_file(),
-        reason="the core for web pages is not compiled: python csrc/wasm/build.py",
-    ),
-]
+pytestmark = web_pages.NEEDS
 
 WIDTH, HEIGHT = 240, 160
 LEAST_PSNR = 45
@@ -284,9 +273,8 @@ def test_tables_that_contradict_each_other_are_refused(site, open_tab):
     """Also if their hash is correct, as in a hostile file."""
     path = min(site.glob("*.v3dg"))
     data = bytearray(path.read_bytes())
-    size = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + size])
-    first = 8 + size + header["groups.parent"]["data_offsets"][0]
+    header, start = web_pages.header_of(data)
+    first = start + header["groups.parent"]["data_offsets"][0]
     data[first : first + 4] = (2**30).to_bytes(4, "little")
     web_pages.renew_hash(data)
     path.write_bytes(data)

@@ -3,28 +3,17 @@ playwright, Chromium on PATH, and the compiled core (`python csrc/wasm/build.py
 v3dg/export/web/core.wasm`)."""
 
 import dataclasses
-import importlib.util
 
 import numpy as np
 import pytest
 
-import chromium
 import scenes_lod
 import v3dg
 import web_pages
 from v3dg.metrics import flip, psnr
 from web_server import serving
 
-pytestmark = [
-    pytest.mark.skipif(chromium.PROGRAM is None, reason="chromium is not installed"),
-    pytest.mark.skipif(
-        importlib.util.find_spec("playwright") is None, reason="playwright is not installed"
-    ),
-    pytest.mark.skipif(
-        not (web_pages.WEB / "core.wasm").is_file(),
-        reason="the core for web pages is not compiled: python csrc/wasm/build.py",
-    ),
-]
+pytestmark = web_pages.NEEDS
 
 LEAST_PSNR = 45
 MOST_FLIP = 0.006

@@ -3,17 +3,30 @@
 import base64
 import contextlib
 import hashlib
+import importlib.util
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import chromium
 from v3dg import export
 from v3dg.bundle.format import HASH_BYTES, hash_of_pieces
 
 WEB = Path(export.__file__).parent / "web"
+# What tests need that draw in Chromium.
+NEEDS = [
+    pytest.mark.skipif(chromium.PROGRAM is None, reason="chromium is not installed"),
+    pytest.mark.skipif(
+        importlib.util.find_spec("playwright") is None, reason="playwright is not installed"
+    ),
+    pytest.mark.skipif(
+        not (WEB / "core.wasm").is_file(),
+        reason="the core for web pages is not compiled: python csrc/wasm/build.py",
+    ),
+]
 # WebGPU in software.
 ARGUMENTS = [
     "--enable-unsafe-webgpu",
@@ -101,11 +114,15 @@ def chromium_with_webgpu():
         browser.close()
 
 
+def header_of(data):
+    """Return the header in the bytes of a bundle's file, and its end."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    return json.loads(data[8:start]), start
+
+
 def renew_hash(data):
     """Set the hash of a bundle's header and tables, in the bytes of its file."""
-    size = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + size])
-    start = 8 + size
+    header, start = header_of(data)
     tables = start + header["pages"]["data_offsets"][1]
     message = bytes(data[:start]) + bytes(data[tables:-HASH_BYTES])
     data[-HASH_BYTES:] = hash_of_pieces(message)
@@ -114,9 +131,7 @@ def renew_hash(data):
 def spoil_page(data, page):
     """Make the ranges of a page infinite, with correct hashes, in the bytes of a
     bundle's file."""
-    size = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + size])
-    start = 8 + size
+    header, start = header_of(data)
 
     def table(name, dtype):
         first, end = (start + place for place in header[name]["data_offsets"])

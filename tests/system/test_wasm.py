@@ -16,6 +16,7 @@ import pytest
 
 import chromium
 import v3dg
+import web_pages
 from random_bundle import random_bundle, random_gaussians
 from v3dg import _core
 from v3dg.bundle.codec import codec_of
@@ -148,11 +149,7 @@ def random_rule(rng):
 def view_of(camera, rule):
     """Return a view for core.js."""
     view = {
-        "viewmat": np.asarray(camera.viewmat, np.float64).reshape(-1).tolist(),
-        "k": np.asarray(camera.K, np.float64).reshape(-1).tolist(),
-        "near": camera.near,
-        "width": camera.width,
-        "height": camera.height,
+        **web_pages.pinhole_of(camera),
         "tolerance": None if rule["tolerance"] == np.inf else rule["tolerance"],
         "minLevel": rule["min_level"],
         "culls": rule["cull"],

@@ -3,13 +3,10 @@
 import json
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 
-from v3dg import export
-
-WEB = Path(export.__file__).parent / "web"
+import web_pages
 
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 
@@ -68,7 +65,7 @@ console.log(JSON.stringify(report));
 
 def test_pages_come_after_and_leave_before_those_above(tmp_path):
     program = tmp_path / "pool.mjs"
-    program.write_text(PROGRAM.replace("POOL", (WEB / "page_pool.js").as_uri()))
+    program.write_text(PROGRAM.replace("POOL", (web_pages.WEB / "page_pool.js").as_uri()))
     done = subprocess.run(["node", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
