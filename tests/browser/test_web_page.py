@@ -15,7 +15,8 @@ from web_server import serving
 
 pytestmark = web_pages.NEEDS
 
-WIDTH, HEIGHT = 240, 160
+WIDTH = 240
+HEIGHT = 160
 LEAST_PSNR = 45
 SECONDS = 30
 TOLERANCE = 3
