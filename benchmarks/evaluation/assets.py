@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import v3dg
+from benchmarks.worlds.procedural import make_asset
 from v3dg import _core
 from v3dg.rotations import rotation_from_quaternion
 
@@ -27,6 +28,15 @@ def read_layout(path: str | Path, bundle: v3dg.Bundle) -> tuple[v3dg.Scene, dict
     """
     name = json.loads(Path(path).read_text(encoding="utf-8"))["asset"]
     return v3dg.read_scene(path, bundles={name: bundle})
+
+
+def layout_bundle(bundle: Path | None, asset: Path | None, device: str) -> v3dg.Bundle:
+    """Return the bundle of a layout: the file `bundle` if there is one, else a draft of
+    the asset, which is made where it is None."""
+    if bundle is not None:
+        return v3dg.Bundle.open(bundle)
+    gaussians = make_asset() if asset is None else v3dg.read_asset(asset)
+    return v3dg.build_bundle(gaussians, progress=False, device=device, quality="draft")
 
 
 def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3dg.Gaussians:

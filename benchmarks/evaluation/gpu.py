@@ -112,6 +112,11 @@ def _left_products(quaternions: Any) -> Any:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
+def base_color(gaussians: v3dg.Gaussians) -> Any:
+    """Return the colours (N, 3) of SH degree 0, tensors."""
+    return (gaussians.sh[:, 0] * _core.sh_base0 + 0.5).clamp_min(0)
+
+
 def has_gsplat() -> bool:
     """Return whether gsplat is installed, so that it can be measured."""
     return importlib.util.find_spec("gsplat") is not None
@@ -149,7 +154,7 @@ def gsplat_frame(
     import torch
 
     if gaussians.sh_degree == 0:
-        colors, degree = (gaussians.sh[:, 0] * _core.sh_base0 + 0.5).clamp_min(0), None
+        colors, degree = base_color(gaussians), None
     else:
         colors, degree = gaussians.sh, gaussians.sh_degree
     device = gaussians.means.device

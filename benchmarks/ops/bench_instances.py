@@ -23,12 +23,10 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import gpu, record
-from benchmarks.evaluation.assets import read_layout
+from benchmarks.evaluation.assets import layout_bundle, read_layout
 from benchmarks.evaluation.measure import Judge, Row, time_ms
-from benchmarks.worlds.procedural import make_asset
 from v3dg._judges import mean_of
 from v3dg.cameras import Camera
-from v3dg.levels import build_bundle
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import Renderer
@@ -69,7 +67,7 @@ class Config:
 def main(config: Config) -> None:
     with gpu.PeakMemory():  # records the memory of an idle process
         torch.zeros(1, device=gpu.DEVICE)
-    bundle = bundle_of(config)
+    bundle = layout_bundle(config.bundle, config.asset, gpu.DEVICE)
     result: dict[str, Any] = {"repeats": config.repeats, "config": bundle.config}
     judge = Judge()
     if config.layout is not None:
@@ -79,13 +77,6 @@ def main(config: Config) -> None:
     result["fields"] = [field(bundle, count, config, judge) for count in config.fields]
     judge.close()
     record.write(config.output, result)
-
-
-def bundle_of(config: Config) -> v3dg.Bundle:
-    if config.bundle is not None:
-        return v3dg.Bundle.open(config.bundle)
-    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
-    return build_bundle(asset, progress=False, device=gpu.DEVICE, quality="draft")
 
 
 def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge) -> Row:

@@ -7,9 +7,6 @@ level. The rays see all around, so that a scan has no frustum.
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -92,7 +89,7 @@ def poses_of(scene: v3dg.Scene, count: int) -> NDArray[np.float64]:
     poses[:, 1, 1] = np.cos(angle)
     poses[:, 0, 3] = reach * way
     poses[:, 1, 3] = reach * np.sin(3 * way) * 0.8
-    poses[:, 2, 3] = 0.9
+    poses[:, 2, 3] = bench_sensors.EYE
     return poses
 
 
@@ -116,14 +113,15 @@ def scans_of(
         "poses_of_a_call": count,
         "tolerance": tolerance,
         "selected": float(np.mean(gaussians)),
-        "scans_per_second": rate(step, calls * count, config),
+        "scans_per_second": bench_sensors.rate(step, calls * count, config, calls=1),
     }
     print(row, flush=True)
     return row
 
 
 def panoramas_of(scene: v3dg.Scene, config: Config) -> Row:
-    view = v3dg.Camera.look_at((0.3, 0.2, 0.9), (1, 1, 0.9), (0, 0, 1), width=64, height=64)
+    height = bench_sensors.EYE
+    view = v3dg.Camera.look_at((0.3, 0.2, height), (1, 1, height), (0, 0, 1), width=64, height=64)
     camera = v3dg.EquirectangularCamera.level(view, (0, 0, 1), config.panorama)
 
     def step() -> None:
@@ -133,7 +131,7 @@ def panoramas_of(scene: v3dg.Scene, config: Config) -> Row:
     return {
         "width": config.panorama,
         "selected": float(v3dg.render(scene, camera, device=config.device).gaussians),
-        "pictures_per_second": rate(step, 1, config),
+        "pictures_per_second": bench_sensors.rate(step, 1, config, calls=1),
     }
 
 
@@ -156,19 +154,6 @@ def on(device: str, array: NDArray[np.float64]) -> Array:
     import torch
 
     return torch.tensor(array, device=device)
-
-
-def rate(step: Callable[[], object], count: int, config: Config) -> float:
-    """Results a second, from an idle device to an idle device: median of
-    repeats."""
-    times = []
-    for _ in range(config.repeats):
-        bench_sensors.synchronize(config.device)
-        start = time.perf_counter()
-        step()
-        bench_sensors.synchronize(config.device)
-        times.append(time.perf_counter() - start)
-    return round(count / statistics.median(times), 1)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import tyro
@@ -28,6 +28,9 @@ from v3dg.gaussians import Array
 from v3dg.render import Channel
 
 Row: TypeAlias = dict[str, float]
+
+PITCH = 3.0  # distance of neighbouring objects in units
+EYE = 0.9  # height of the cameras in units
 
 # The channels of the room: colour and these.
 SENSED: tuple[Channel, ...] = ("depth", "normal", "instance", "label")
@@ -84,12 +87,12 @@ def make_bundles(config: Config) -> list[v3dg.Bundle]:
 
 
 def floor_of(bundles: list[v3dg.Bundle], count: int) -> v3dg.Scene:
-    """Objects on a grid three units apart."""
+    """Objects on a grid."""
     scene = v3dg.Scene()
     side = int(np.ceil(np.sqrt(count)))
     place = np.arange(count)
-    middle = 1.5 * (side - 1)
-    rows = [3.0 * (place % side) - middle, 3.0 * (place // side) - middle, np.zeros(count)]
+    middle = PITCH / 2 * (side - 1)
+    rows = [PITCH * (place % side) - middle, PITCH * (place // side) - middle, np.zeros(count)]
     positions = np.stack(rows, axis=1)
     turn = np.random.default_rng(0).uniform(0, np.pi, count)
     quaternions = np.stack([np.cos(turn), 0 * turn, 0 * turn, np.sin(turn)], axis=1)
@@ -101,10 +104,10 @@ def floor_of(bundles: list[v3dg.Bundle], count: int) -> v3dg.Scene:
 def cameras_of(scene: v3dg.Scene, count: int, size: int) -> list[v3dg.Camera]:
     """Cameras at eye level between the objects, which look along the floor."""
     rng = np.random.default_rng(1)
-    reach = np.abs(scene.positions[:, :2]).max() + 1.5
+    reach = np.abs(scene.positions[:, :2]).max() + PITCH / 2
     cameras = []
     for _ in range(count):
-        eye = np.append(rng.uniform(-reach, reach, 2), 0.9)
+        eye = np.append(rng.uniform(-reach, reach, 2), EYE)
         angle = rng.uniform(0, 2 * np.pi)
         target = eye + np.array([np.cos(angle), np.sin(angle), -0.15])
         cameras.append(v3dg.Camera.look_at(eye, target, fov_x=1.2, width=size, height=size))
@@ -278,12 +281,18 @@ def batch_on(cameras: list[v3dg.Camera], device: str) -> v3dg.CameraBatch:
     return v3dg.CameraBatch(viewmats, K, batch.width, batch.height)
 
 
-def rate(draw: Callable[[], object], count: int, config: Config) -> float:
-    """Pictures a second, from an idle device to an idle device, of several calls in a
-    row; the median of repeats."""
-    calls = 1
-    if config.device == "cuda":
-        calls = 5
+class Timing(Protocol):
+    """The options of a measurement that say how often calls are timed, and where."""
+
+    device: str
+    repeats: int
+
+
+def rate(draw: Callable[[], object], count: int, config: Timing, calls: int = 5) -> float:
+    """Results a second, from an idle device to an idle device, of several calls in a
+    row (on the CPU, one); the median of repeats."""
+    if config.device != "cuda":
+        calls = 1
     times = []
     for _ in range(config.repeats):
         synchronize(config.device)

@@ -28,11 +28,10 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
-from benchmarks.evaluation.assets import read_layout
+from benchmarks.evaluation.assets import layout_bundle, read_layout
 from benchmarks.evaluation.measure import times_ms
 from benchmarks.studies.peers import scenes
 from benchmarks.studies.two_versions import digest
-from benchmarks.worlds.procedural import make_asset
 from v3dg.cameras import Camera
 
 Row = dict[str, Any]
@@ -92,7 +91,8 @@ def frames(config: Config) -> Iterator[Frame]:
             config, subject.name, v3dg.Renderer(subject.gaussians), subject.cameras, None
         )
     if config.layout is not None:
-        scene, views = read_layout(config.layout, _bundle_of(config))
+        bundle = layout_bundle(config.bundle, config.asset, "cuda")
+        scene, views = read_layout(config.layout, bundle)
         renderer = v3dg.Renderer(scene, device="cuda")
         for tolerance in config.tolerances:
             for number in config.cameras:
@@ -103,13 +103,6 @@ def frames(config: Config) -> Iterator[Frame]:
                     views[name],
                     tolerance,
                 )
-
-
-def _bundle_of(config: Config) -> v3dg.Bundle:
-    if config.bundle is not None:
-        return v3dg.Bundle.open(config.bundle)
-    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
-    return v3dg.build_bundle(asset, device="cuda", progress=False, quality="draft")
 
 
 def _sized(

@@ -38,9 +38,11 @@ from v3dg.select import Selection
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-# As in csrc/frame: the size of a tile in px, records over more tiles than this are
-# large, and the number of gaussians of an item.
-_TILE_WIDTH, _TILE_HEIGHT, _FEW_TILES, _ITEM = 32, 16, 4, 256
+# As in csrc/frame.
+_TILE_WIDTH = 32  # px
+_TILE_HEIGHT = 16  # px
+_FEW_TILES = 4  # records over more tiles are large
+_ITEM = 256  # gaussians of an item
 _RUN = 32  # records of a run
 _MIN_ALPHA = 1 / 255
 _AT_ONCE = 1_000_000  # gaussians that are projected together
@@ -117,11 +119,16 @@ def items_of(part: Selection) -> Ints:
     starts = np.ones(len(part), bool)
     starts[1:] = (np.diff(part.instance_ids) != 0) | (np.diff(part.cluster_ids) != 1)
     joined = np.cumsum(starts) - 1
-    of_gaussian = np.repeat(joined, sizes)
-    first = np.flatnonzero(np.r_[True, np.diff(of_gaussian) != 0])
-    length = np.diff(np.r_[first, len(of_gaussian)])
-    within = np.arange(len(of_gaussian)) - np.repeat(first, length)
-    return np.cumsum(within % _ITEM == 0) - 1
+    return pieces_of(np.repeat(joined, sizes), _ITEM)
+
+
+def pieces_of(keys: Ints, size: int) -> Ints:
+    """Return the piece of each element, where neighbours with one key are cut into
+    pieces of up to `size`."""
+    first = np.flatnonzero(np.r_[True, np.diff(keys) != 0])
+    length = np.diff(np.r_[first, len(keys)])
+    within = np.arange(len(keys)) - np.repeat(first, length)
+    return np.cumsum(within % size == 0) - 1
 
 
 def project(part: Selection, camera: Camera) -> Records:
@@ -159,21 +166,17 @@ def records_of(
         area = 2 * np.pi * opacities / np.sqrt(determinant)
     low = np.ceil(np.maximum(centers - half - 0.5, 0))
     high = np.floor(np.minimum(centers + half - 0.5, [camera.width - 1, camera.height - 1]))
-    kept = np.flatnonzero((opacities > _MIN_ALPHA) & (low <= high).all(axis=1))
-    low = low[kept].astype(np.int64)
-    high = high[kept].astype(np.int64)
-    items = item[kept]
-    first = np.flatnonzero(np.r_[True, np.diff(items) != 0])
-    length = np.diff(np.r_[first, len(items)])
-    within = np.arange(len(items)) - np.repeat(first, length)
+    rows = np.flatnonzero((opacities > _MIN_ALPHA) & (low <= high).all(axis=1))
+    low = low[rows].astype(np.int64)
+    high = high[rows].astype(np.int64)
     return Records(
         left=low[:, 0] // _TILE_WIDTH,
         right=high[:, 0] // _TILE_WIDTH,
         top=low[:, 1] // _TILE_HEIGHT,
         bottom=high[:, 1] // _TILE_HEIGHT,
-        depth=depths[kept],
-        run=np.cumsum(within % _RUN == 0) - 1,
-        cover=area[kept].astype(np.float32),
+        depth=depths[rows],
+        run=pieces_of(item[rows], _RUN),
+        cover=area[rows].astype(np.float32),
     )
 
 

@@ -23,11 +23,12 @@ import numpy as np
 import tyro
 
 import v3dg
-from benchmarks.evaluation import record
+from benchmarks.evaluation import gpu, record
+from benchmarks.evaluation.evaluation import resized
 from benchmarks.evaluation.measure import Judge, times_ms
 from benchmarks.ops import bench_sensors
 from benchmarks.worlds import procedural
-from v3dg import _core, metrics
+from v3dg import metrics
 from v3dg.pictures import Picture, to_8bit
 
 if TYPE_CHECKING:
@@ -35,10 +36,8 @@ if TYPE_CHECKING:
 
 Row: TypeAlias = dict[str, object]
 
-_PITCH = 3.0  # distance of neighbouring objects in units
 _SIDE = 2.4  # longest side of an object in units
 _AISLE = 0.25  # half the width of the aisles between objects in units
-_EYE = 0.9  # height of the cameras in units
 _SAMPLES = 8  # of a reference picture along each side of a pixel of the largest size
 _FEW = 4  # judged cameras that are drawn together
 _PEER_REPEATS = 3  # timed calls of other renderers
@@ -157,11 +156,13 @@ def cameras_of(scene: v3dg.Scene, count: int, side: int) -> list[v3dg.Camera]:
     at one object."""
     rng = np.random.default_rng(1)
     lines = np.unique(scene.positions[:, 0])
-    crossings = np.append(lines - _PITCH / 2, lines[-1] + _PITCH / 2)
+    margin = bench_sensors.PITCH / 2
+    crossings = np.append(lines - margin, lines[-1] + margin)
+    height = bench_sensors.EYE
     cameras = []
     for _ in range(count):
-        eye = np.append(rng.choice(crossings, 2) + rng.uniform(-_AISLE, _AISLE, 2), _EYE)
-        target = scene.positions[rng.integers(len(scene))] + [0, 0, _EYE / 2]
+        eye = np.append(rng.choice(crossings, 2) + rng.uniform(-_AISLE, _AISLE, 2), height)
+        target = scene.positions[rng.integers(len(scene))] + [0, 0, height / 2]
         cameras.append(v3dg.Camera.look_at(eye, target, fov_x=1.2, width=side, height=side))
     return cameras
 
@@ -208,7 +209,7 @@ class Gsplat:
             g.quats,
             g.scales,
             g.opacities,
-            _colors(g),
+            gpu.base_color(g),
             viewmats,
             K,
             size,
@@ -219,11 +220,6 @@ class Gsplat:
             rasterize_mode=mode,
         )
         return pictures
-
-
-def _colors(gaussians: v3dg.Gaussians) -> torch.Tensor:
-    colors: torch.Tensor = (gaussians.sh[:, 0] * _core.sh_base0 + 0.5).clamp_min(0)
-    return colors
 
 
 @dataclass
@@ -261,7 +257,7 @@ class Vectorized:
                 scales=g.scales,
                 rotations=g.quats,
                 opacities=g.opacities,
-                features=_colors(g).contiguous(),
+                features=gpu.base_color(g).contiguous(),
                 semantic_ids=torch.zeros(len(g), dtype=torch.int64, device="cuda"),
             )
             self._services[count, size] = service
@@ -276,7 +272,6 @@ class Comparison:
         self.cameras = cameras
         self.renderer = v3dg.Renderer(scene, device=config.device, memory=None)
         self.renderer_of_all = v3dg.Renderer(scene, device=config.device, memory=None)
-        self.timing = bench_sensors.Config(device=config.device, repeats=config.repeats)
         self.judge = Judge()
         self.fine = self._fine_pictures()
         print(f"{len(self.fine)} reference pictures", flush=True)
@@ -333,7 +328,7 @@ class Comparison:
         peers: list[list[Peer]] = []
         if self.config.device == "cpu":
             return peers
-        if importlib.util.find_spec("gsplat") is not None:
+        if gpu.has_gsplat():
             peers.append([Gsplat(self.world, packed) for packed in (False, True)])
             filtered = Gsplat(self.world, packed=True, eps2d=0.3, antialiased=True)
             peers.append([filtered])
@@ -341,12 +336,12 @@ class Comparison:
             peers.append([Vectorized(self.world)])
         return peers
 
-    def _at(self, size: int) -> list[v3dg.Camera]:
-        factor = size / max(self.config.sizes)
-        return [at_size(camera, size, factor) for camera in self.cameras]
+    def _cameras_of(self, size: int) -> list[v3dg.Camera]:
+        return [resized(camera, (size, size)) for camera in self.cameras]
 
     def _ours(self, size: int, tolerance: float, truths: list[Picture]) -> Row:
-        cameras = self._at(size)
+        cameras = self._cameras_of(size)
+        judged = cameras[: len(truths)]
         renderer = self.renderer
         if tolerance == 0:
             # All gaussians, for as many cameras as the others are timed with. Batches
@@ -354,7 +349,6 @@ class Comparison:
             cameras = cameras[: self.config.timed]
             renderer = self.renderer_of_all
         batch = bench_sensors.batch_on(cameras, self.config.device)
-        judged = self._at(size)[: len(truths)]
         drawn = [
             renderer.render_batch(
                 bench_sensors.batch_on(judged[first : first + _FEW], self.config.device),
@@ -368,7 +362,7 @@ class Comparison:
         rate = bench_sensors.rate(
             lambda: renderer.render_batch(batch, tolerance=tolerance),
             len(cameras),
-            self.timing,
+            self.config,
         )
         return {
             "renderer": "v3dg",
@@ -382,7 +376,7 @@ class Comparison:
         """Yield a row for each number of cameras in a call that fits into memory."""
         import torch
 
-        cameras = self._at(size)
+        cameras = self._cameras_of(size)
         batch = v3dg.CameraBatch.of(cameras)
         viewmats = torch.tensor(batch.viewmats, dtype=torch.float32, device=self.config.device)
         K = torch.tensor(batch.K, dtype=torch.float32, device=self.config.device)
@@ -432,12 +426,6 @@ class Comparison:
             "psnr": round(statistics.fmean(psnrs), 2),
             "rmse": round(math.sqrt(statistics.fmean(squares)), 6),
         }
-
-
-def at_size(camera: v3dg.Camera, size: int, factor: float) -> v3dg.Camera:
-    """Return the same square camera with another resolution."""
-    K = camera.K * np.array([[factor], [factor], [1.0]])
-    return v3dg.Camera(camera.viewmat, K, size, size, camera.near)
 
 
 def number(value: object) -> float:

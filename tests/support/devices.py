@@ -1,6 +1,8 @@
 """Arrays on either device, NumPy's on the CPU and torch tensors on CUDA, for tests that
 run on both."""
 
+import contextlib
+
 import numpy as np
 
 from v3dg import Gaussians
@@ -30,3 +32,18 @@ def host(value):
     if isinstance(value, Gaussians):
         return value.numpy()
     return value if isinstance(value, np.ndarray) else value.detach().cpu().numpy()
+
+
+@contextlib.contextmanager
+def free_memory(num_bytes):
+    """Leave at most this much memory of the GPU free."""
+    import torch
+
+    torch.cuda.empty_cache()
+    free = torch.cuda.mem_get_info()[0]
+    rest = torch.empty(max(0, free - num_bytes), dtype=torch.uint8, device="cuda")
+    try:
+        yield
+    finally:
+        del rest
+        torch.cuda.empty_cache()

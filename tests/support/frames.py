@@ -8,8 +8,8 @@ import numpy as np
 import scenes_lod
 import v3dg
 from compare import PICTURE_FLOAT
-from devices import host
-from v3dg import Camera
+from devices import host, on
+from v3dg import Camera, CameraBatch, Scene
 
 CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
 
@@ -50,6 +50,13 @@ def assert_like_cpu(image, expected):
     assert image.stats.gaussians_in_frustum == expected.stats.gaussians_in_frustum
 
 
+def tensors_of(cameras, **options):
+    """Return a batch of cameras of one size as tensors on the GPU."""
+    arrays = CameraBatch.of(cameras)
+    viewmats, K = on("cuda", (arrays.viewmats, arrays.K))
+    return CameraBatch(viewmats, K, arrays.width, arrays.height, **options)
+
+
 def composed_scene(rng, sh_degree=1):
     bundles = [
         scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), 64)
@@ -57,4 +64,20 @@ def composed_scene(rng, sh_degree=1):
     ]
     scene = scenes_lod.random_scene(rng, bundles[0], 30, spread=3.0)
     scene.add(bundles[1], positions=rng.normal(size=(7, 3)), quaternions=rng.normal(size=(7, 4)))
+    return scene
+
+
+def tinted_scene(rng):
+    """Return instances of one bundle, each with an opacity and a tint of its own."""
+    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 400), 32)
+    scene = Scene()
+    count = 90
+    scene.add(
+        bundle,
+        positions=rng.normal(0, 3, (count, 3)),
+        quaternions=rng.normal(size=(count, 4)),
+        scales=np.exp(rng.normal(-1, 0.5, count)),
+        opacity=rng.choice([0.0, 0.4, 1.0], count),
+        tint=rng.uniform(0, 2, (count, 3)),
+    )
     return scene

@@ -65,8 +65,13 @@ def leaves(
 
 
 def draw(inputs, cameras, **options):
+    places = of_cameras(cameras, dtype=inputs[0].dtype, device=inputs[0].device)
+    return draw_at(places, inputs, **options)
+
+
+def draw_at(places, inputs, **options):
+    """Draw from the places that `of_cameras` returns."""
     *shape, colors, backgrounds = inputs
-    places = of_cameras(cameras, dtype=shape[0].dtype, device=shape[0].device)
     return rasterization(*shape, colors, **places, backgrounds=backgrounds, **options)
 
 
@@ -202,18 +207,8 @@ def test_gradients_of_poses_are_those_of_autograd(render_mode, sh_degree, packed
     rasterize_mode = "antialiased" if antialiased else "classic"
     options = {"render_mode": render_mode, "sh_degree": sh_degree}
     places = of_cameras(CAMERAS)
-    viewmats = places.pop("viewmats").requires_grad_()
-    *shape, colors, backgrounds = inputs
-    got = rasterization(
-        *shape,
-        colors,
-        viewmats,
-        **places,
-        backgrounds=backgrounds,
-        packed=packed,
-        rasterize_mode=rasterize_mode,
-        **options,
-    )[:2]
+    viewmats = places["viewmats"].requires_grad_()
+    got = draw_at(places, inputs, packed=packed, rasterize_mode=rasterize_mode, **options)[:2]
     wanted = expected(inputs, posed(CAMERAS, viewmats), antialiased=antialiased, **options)
     of_all = [viewmats, *inputs]
     wanted_gradients = gradients(weighted_sum(*wanted), of_all)
@@ -224,16 +219,14 @@ def test_gradients_of_poses_are_those_of_autograd(render_mode, sh_degree, packed
 
 def test_gradients_of_poses_in_single_precision(device):
     results = []
-    for dtype, where in ((torch.float64, "cpu"), (torch.float32, device)):
-        *shape, colors, backgrounds = leaves(CAMERAS, 200, dtype=dtype, device=where)
-        places = of_cameras(CAMERAS, dtype=dtype, device=where)
+    for dtype, target in ((torch.float64, "cpu"), (torch.float32, device)):
+        inputs = leaves(CAMERAS, 200, dtype=dtype, device=target)
+        places = of_cameras(CAMERAS, dtype=dtype, device=target)
         places["viewmats"].requires_grad_()
-        pictures, alphas, _ = rasterization(
-            *shape, colors, **places, backgrounds=backgrounds, sh_degree=3, render_mode="RGB+ED"
-        )
+        pictures, alphas, _ = draw_at(places, inputs, sh_degree=3, render_mode="RGB+ED")
         weighted_sum(pictures, alphas).backward()
         assert places["viewmats"].grad.device == places["viewmats"].device
-        results.append([t.grad.cpu().double() for t in (places["viewmats"], *shape, colors)])
+        results.append([t.grad.cpu().double() for t in (places["viewmats"], *inputs[:5])])
     for double, single in zip(*results, strict=True):
         assert_gradients_agree(single, double, GRADIENT_FLOAT)
 
@@ -324,29 +317,25 @@ def test_sets_of_gaussians_are_drawn_apart(device, packed, for_each_camera):
     assert alphas.shape == (2, 2, 2, 19, 23, 1)
     assert (info["n_batches"], info["n_cameras"]) == (4, 2)
     weights = torch.rand_like(pictures)
-    found = torch.autograd.grad((pictures * weights).sum(), [viewmats, *together])
+    grads = torch.autograd.grad((pictures * weights).sum(), [viewmats, *together])
     first = 0
     for number, one in enumerate(sets):
-        at = divmod(number, 2)
+        index = divmod(number, 2)
         places["viewmats"] = places["viewmats"].detach().requires_grad_()
-        picture, alpha, of_set = draw_set(one, places, options)
-        assert torch.equal(pictures[at], picture)
-        assert torch.equal(alphas[at], alpha)
-        alone = torch.autograd.grad((picture * weights[at]).sum(), [places["viewmats"], *one])
-        for g, w in zip(found, alone, strict=True):
-            assert torch.equal(g[at], w)
+        picture, alpha, of_set = draw_at(places, one, **options)
+        assert torch.equal(pictures[index], picture)
+        assert torch.equal(alphas[index], alpha)
+        alone = torch.autograd.grad((picture * weights[index]).sum(), [places["viewmats"], *one])
+        for g, w in zip(grads, alone, strict=True):
+            assert torch.equal(g[index], w)
         for name in ("means2d", "depths", "conics", "opacities", "radii"):
-            rows = info[name][at] if not packed else info[name][first : first + len(of_set[name])]
+            part = slice(first, first + len(of_set[name])) if packed else index
+            rows = info[name][part]
             assert torch.equal(rows, of_set[name])
         if packed:
             ids = info["batch_ids"][first : first + len(of_set["depths"])]
             assert (ids == number).all()
             first += len(of_set["depths"])
-
-
-def draw_set(inputs, places, options):
-    *shape, colors, backgrounds = inputs
-    return rasterization(*shape, colors, **places, backgrounds=backgrounds, **options)
 
 
 @pytest.mark.gpu
@@ -357,20 +346,20 @@ def test_cameras_that_are_drawn_in_parts_give_the_same():
     inputs = leaves(cameras, 300, sh_degree=1, dtype=torch.float32, device="cuda")
     places = of_cameras(cameras, dtype=torch.float32, device="cuda")
     places["viewmats"].requires_grad_()
-    picture, _, _ = draw_set(inputs, places, {"sh_degree": 1})
-    found = torch.autograd.grad(picture.square().sum(), [places["viewmats"], *inputs[:5]])
+    picture, _, _ = draw_at(places, inputs, sh_degree=1)
+    together = torch.autograd.grad(picture.square().sum(), [places["viewmats"], *inputs[:5]])
     sums = None
     for c, camera in enumerate(cameras):
         place = of_cameras([camera], dtype=torch.float32, device="cuda")
         place["viewmats"].requires_grad_()
         one = [*inputs[:5], inputs[5][c : c + 1]]
-        alone, _, _ = draw_set(one, place, {"sh_degree": 1})
+        alone, _, _ = draw_at(place, one, sh_degree=1)
         assert torch.equal(picture[c], alone[0])
         grads = torch.autograd.grad(alone.square().sum(), [place["viewmats"], *inputs[:5]])
-        assert torch.equal(found[0][c], grads[0][0])
+        assert torch.equal(together[0][c], grads[0][0])
         of_inputs = list(grads[1:])
         sums = of_inputs if sums is None else [a + b for a, b in zip(sums, of_inputs, strict=True)]
-    for g, w in zip(found[1:], sums, strict=True):
+    for g, w in zip(together[1:], sums, strict=True):
         assert torch.equal(g, w)
 
 

@@ -250,14 +250,7 @@ def test_full_device_is_a_memory_error(mib_left, message):
         return _core.median_split(means, np.array([0, len(means)]), depth)
 
     means = torch.zeros((100_000_000, 3), device="cuda")
-    torch.cuda.empty_cache()
-    free = torch.cuda.mem_get_info()[0]
-    rest = torch.empty(max(0, free - (mib_left << 20)), dtype=torch.uint8, device="cuda")
-    try:
-        with pytest.raises(MemoryError, match=message):
-            split(means)
-    finally:
-        del rest
-        torch.cuda.empty_cache()
+    with devices.free_memory(mib_left << 20), pytest.raises(MemoryError, match=message):
+        split(means)
     order, _ = split(means[:1000])
     assert order.tolist() == list(range(1000))

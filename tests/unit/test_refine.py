@@ -545,10 +545,10 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows, win
 
 def test_gaussians_of_radius_0_do_not_move(bundle, device):
     config = replace(BuildConfig(), steps=5, first_steps=5, filter_px2=0.1, **STEP_SIZES)
-    gaussians, given = arguments(bundle, device, config, pictures_of(bundle))
+    gaussians, inputs = arguments(bundle, device, config, pictures_of(bundle))
     stays = bundle.num_gaussians // 2 < np.arange(bundle.num_gaussians)
-    given["radius"][stays] = 0
-    _core.refine_cuts(**given)
+    inputs["radius"][stays] = 0
+    _core.refine_cuts(**inputs)
     moves = ~stays
     moves[: len(bundle.level_gaussians(0))] = False
     moved = host(gaussians)

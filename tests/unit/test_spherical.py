@@ -195,7 +195,7 @@ def test_a_ray_does_not_depend_on_the_other_rays(device):
     for rows, columns in ((slice(3, 5), slice(None)), (slice(None), slice(61, 64)), ([7], [20])):
         part = replace(LIDAR, azimuth=LIDAR.azimuth[columns], elevation=LIDAR.elevation[rows])
         scanned = scanned_on(device, scene, part, pose)
-        for name in ("range", "intensity", "second_range", "second_intensity", "alpha"):
+        for name in PLANES:
             expected = getattr(whole, name)[rows][:, columns]
             np.testing.assert_array_equal(getattr(scanned, name), expected, err_msg=name)
 
@@ -428,8 +428,10 @@ def test_scans_of_both_devices_agree():
         on_cuda = scanned_on("cuda", scene, lidar, pose)
         assert on_cpu.gaussians == on_cuda.gaussians
         for name in PLANES:
-            ours, expected = getattr(on_cuda, name), getattr(on_cpu, name)
-            assert np.isclose(ours, expected, rtol=1e-4, atol=1e-4).mean() > 0.998, name
+            is_close = np.isclose(
+                getattr(on_cuda, name), getattr(on_cpu, name), rtol=1e-4, atol=1e-4
+            )
+            assert is_close.mean() > 0.998, name
 
 
 @pytest.mark.gpu

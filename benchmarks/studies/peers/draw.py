@@ -15,7 +15,6 @@ from typing import Any, TypeAlias
 import v3dg
 from benchmarks.evaluation import gpu
 from benchmarks.studies.peers.scenes import Subject
-from v3dg import _core
 from v3dg.cameras import Camera
 
 Draw: TypeAlias = Callable[[], Any]
@@ -184,7 +183,7 @@ def higs(sh_compression: str) -> Prepare:
 
         g = subject.gaussians
         compression = sh_compression if g.sh_degree == 3 else "none"
-        colors, degree = (base_color(g), None) if g.sh_degree == 0 else (g.sh, g.sh_degree)
+        colors, degree = (gpu.base_color(g), None) if g.sh_degree == 0 else (g.sh, g.sh_degree)
         scene = GaussianInferenceScene.from_gaussian_tensors(
             g.means,
             g.quats,
@@ -368,10 +367,6 @@ def tensor(array: Any, like: Any) -> Any:
     import torch
 
     return torch.as_tensor(array, dtype=torch.float32, device=like.device).contiguous()
-
-
-def base_color(gaussians: v3dg.Gaussians) -> Any:
-    return (gaussians.sh[:, 0] * _core.sh_base0 + 0.5).clamp_min(0)
 
 
 def keeps(*names: str) -> Callable[[Subject, float], tuple[str, ...]]:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.worlds.procedural._parts import Array
+from benchmarks.worlds.procedural._light import SH_C0
+from benchmarks.worlds.procedural._parts import Array, unit
 from v3dg.gaussians import Gaussians
 
 SIZE = np.array([8.0, 6.0, 2.8])  # metres; the floor is at z = 0, its middle at the origin
@@ -16,7 +17,6 @@ _FURNITURE = 26
 _CLUTTER = 320
 _FLOATERS = 0.004  # fraction of the gaussians that are on no surface
 _LOOKS = 1 << 14  # different dependences of the colour on the view
-_C0 = 0.28209479177387814  # the SH basis of degree 0
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def make_room(num_gaussians: int = 5_500_000, *, seed: int = 0, sh_degree: int =
     opacities = np.where(floats, faint, 1 - rng.random(num_gaussians) ** 3)
     table = 0.03 * rng.standard_normal((_LOOKS, (sh_degree + 1) ** 2, 3), dtype=np.float32)
     sh = table[rng.integers(_LOOKS, size=num_gaussians)]
-    sh[:, 0] = (faces.colour[which] + _texture(means, rng) - 0.5) / _C0
+    sh[:, 0] = (faces.colour[which] + _texture(means, rng) - 0.5) / SH_C0
     rows = (means, _turned(faces, which, rng), scales, opacities, sh)
     return Gaussians(*(np.ascontiguousarray(row, dtype=np.float32) for row in rows))
 
@@ -120,13 +120,12 @@ def _texture(means: Array, rng: np.random.Generator) -> NDArray[np.float32]:
 
 def _turned(faces: _Faces, which: NDArray[np.int64], rng: np.random.Generator) -> Array:
     """Return quaternions that turn z to the normals of faces, and x anywhere."""
-    normals = np.cross(faces.edges[:, 0], faces.edges[:, 1])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normal = normals[which] + 0.05 * rng.standard_normal((len(which), 3), dtype=np.float32)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normals = unit(np.cross(faces.edges[:, 0], faces.edges[:, 1]))
+    noise = rng.standard_normal((len(which), 3), dtype=np.float32)
+    normal = unit(normals[which] + 0.05 * noise)
     half = normal + np.array([0, 0, 1])
     half[np.linalg.norm(half, axis=1) < 1e-6] = [1, 0, 0]
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    half = unit(half)
     # A turn around z, then the half turn around `half`, which exchanges z and the
     # normal.
     angle = rng.uniform(0, np.pi, len(which))

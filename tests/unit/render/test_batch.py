@@ -6,10 +6,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+import frames
 import scenes_lod
 import v3dg
 from devices import host, on
-from frames import composed_scene
+from frames import composed_scene, tensors_of
 from v3dg import BatchPlanes, Camera, CameraBatch, Scene
 from v3dg.donut import make_donut
 from v3dg.residency import residency
@@ -26,18 +27,8 @@ def scene():
 @pytest.fixture(scope="module")
 def tinted_scene():
     rng = np.random.default_rng(4)
-    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 400), 32)
-    scene = Scene()
-    count = 90
-    scene.add(
-        bundle,
-        positions=rng.normal(0, 3, (count, 3)),
-        quaternions=rng.normal(size=(count, 4)),
-        scales=np.exp(rng.normal(-1, 0.5, count)),
-        importance=np.exp(rng.normal(0, 0.5, count)),
-        opacity=rng.choice([0.0, 0.4, 1.0], count),
-        tint=rng.uniform(0, 2, (count, 3)),
-    )
+    scene = frames.tinted_scene(rng)
+    scene.set_importance(np.exp(rng.normal(0, 0.5, len(scene))))
     return scene
 
 
@@ -370,15 +361,6 @@ def test_pictures_of_a_batch_are_indexed(scene, device):
     np.testing.assert_array_equal(host(batch[-1].color), host(batch.color)[2])
     with pytest.raises(IndexError, match="picture: expected 0 to 2, got 3"):
         batch[3]
-
-
-def tensors_of(cameras, **options):
-    """Return the cameras as tensors on the device."""
-    import torch
-
-    arrays = CameraBatch.of(cameras)
-    viewmats, K = (torch.tensor(array, device="cuda") for array in (arrays.viewmats, arrays.K))
-    return CameraBatch(viewmats, K, WIDTH, HEIGHT, **options)
 
 
 @pytest.mark.gpu

@@ -9,7 +9,7 @@ import pytest
 
 import scenes
 import scenes_lod
-from devices import host
+from devices import free_memory, host
 from frames import CAMERA, Renderer, assert_like_cpu, assert_same_bytes, composed_scene, render
 from v3dg import Camera, Gaussians, Scene, rasterize, select
 
@@ -209,8 +209,6 @@ def test_buffers_exceed_a_frame_by_a_sixteenth():
 
 def test_full_device_gets_back_the_memory_of_frames():
     """There is room for one frame, but not for two."""
-    import torch
-
     scene = crowd()
     renderer = Renderer(scene, device="cuda")
     drawn(renderer)
@@ -218,35 +216,23 @@ def test_full_device_gets_back_the_memory_of_frames():
     assert num_bytes > 100 << 20
     del renderer
     gc.collect()
-    torch.cuda.empty_cache()
-    free = torch.cuda.mem_get_info()[0]
-    rest = torch.empty(max(0, free - 3 * num_bytes // 2), dtype=torch.uint8, device="cuda")
-    try:
+    with free_memory(3 * num_bytes // 2):
         for _ in range(3):
             assert drawn(Renderer(scene, device="cuda")) > 1_000_000
             gc.collect()
-    finally:
-        del rest
-        torch.cuda.empty_cache()
 
 
 def test_full_device_is_a_memory_error_of_a_frame():
-    import torch
-
     scene = crowd()
     expected = Renderer(scene, device="cuda").render(CAMERA, tolerance=0.0)
     renderer = Renderer(scene, device="cuda")
     renderer.render(CAMERA, tolerance=np.inf).stats  # noqa: B018  waits
     gc.collect()
-    torch.cuda.empty_cache()
-    free = torch.cuda.mem_get_info()[0]
-    rest = torch.empty(max(0, free - (48 << 20)), dtype=torch.uint8, device="cuda")
-    try:
-        with pytest.raises(MemoryError, match=r"requested .* MiB, free: .* MiB of .* MiB"):
-            drawn(renderer)
-    finally:
-        del rest
-        torch.cuda.empty_cache()
+    with (
+        free_memory(48 << 20),
+        pytest.raises(MemoryError, match=r"requested .* MiB, free: .* MiB of .* MiB"),
+    ):
+        drawn(renderer)
     assert_same_bytes(renderer.render(CAMERA, tolerance=0.0), expected)
 
 

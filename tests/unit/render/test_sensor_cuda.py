@@ -6,10 +6,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+import frames
 import scenes_lod
 import v3dg
-from devices import host
-from frames import composed_scene
+from devices import host, on
+from frames import composed_scene, tensors_of
 from random_bundle import random_bundle
 from v3dg import BatchPlanes, Camera, CameraBatch, MeshLayer, Scene
 
@@ -36,19 +37,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def tinted_scene():
-    rng = np.random.default_rng(4)
-    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 400), 32)
-    scene = Scene()
-    count = 90
-    scene.add(
-        bundle,
-        positions=rng.normal(0, 3, (count, 3)),
-        quaternions=rng.normal(size=(count, 4)),
-        scales=np.exp(rng.normal(-1, 0.5, count)),
-        opacity=rng.choice([0.0, 0.4, 1.0], count),
-        tint=rng.uniform(0, 2, (count, 3)),
-    )
-    return scene
+    return frames.tinted_scene(np.random.default_rng(4))
 
 
 def camera_at(eye=(0, -6, 1)):
@@ -76,14 +65,6 @@ def part_of(mesh, number):
         if plane is not None:
             planes[name] = plane[number]
     return dataclasses.replace(mesh, **planes)
-
-
-def tensors_of(cameras, **options):
-    import torch
-
-    viewmats = torch.tensor(np.stack([camera.viewmat for camera in cameras]), device="cuda")
-    K = torch.tensor(np.stack([camera.K for camera in cameras]), device="cuda")
-    return CameraBatch(viewmats, K, cameras[0].width, cameras[0].height, **options)
 
 
 def on_cuda(mesh):
@@ -137,28 +118,29 @@ def assert_like_cpu(image, expected, planes=PLANES, share=0.01):
     assert (differs & ~ties).mean() < 0.003
 
 
+def assert_devices_agree(subject, camera, **options):
+    """Compare all channels of both devices; return the picture of the CPU."""
+    image, expected = (
+        v3dg.render(subject, camera, channels=CHANNELS, device=device, **options)
+        for device in ("cuda", "cpu")
+    )
+    assert_like_cpu(image, expected)
+    return expected
+
+
 @pytest.mark.parametrize("options", OPTIONS)
 @pytest.mark.parametrize("light", [None, "display", "linear"])
 def test_scenes_have_the_channels_of_the_cpu(scene, options, light):
     mesh = None if light is None else mesh_of((HEIGHT, WIDTH), light=light)
     for eye in ((0, -6, 1), (0.4, 0.2, 0.1), (0, -30, 5)):
-        camera = camera_at(eye)
-        drawn = [
-            v3dg.render(scene, camera, channels=CHANNELS, mesh=mesh, device=device, **options)
-            for device in ("cuda", "cpu")
-        ]
-        assert_like_cpu(*drawn)
+        assert_devices_agree(scene, camera_at(eye), mesh=mesh, **options)
 
 
 def test_instances_with_factors_have_the_channels_of_the_cpu(tinted_scene):
     """Instances that are far away share items."""
     for eye in ((0, -16, 1), (0, -60, 5)):
-        drawn = [
-            v3dg.render(tinted_scene, camera_at(eye), channels=CHANNELS, device=device)
-            for device in ("cuda", "cpu")
-        ]
-        assert_like_cpu(*drawn)
-        assert len(np.unique(drawn[1].instance)) > 5
+        drawn = assert_devices_agree(tinted_scene, camera_at(eye))
+        assert len(np.unique(drawn.instance)) > 5
 
 
 @pytest.mark.parametrize("options", OPTIONS)
@@ -242,7 +224,7 @@ def test_cameras_of_an_environment_name_the_instances_of_the_scene():
     renderer = v3dg.Renderer(scene, device="cuda", memory=None)
     views = [camera_at(), camera_at()]
     on_host = CameraBatch.of(views, environments=[0, 1])
-    for cameras in (on_host, tensors_of(views, environments=on_ids([0, 1]))):
+    for cameras in (on_host, tensors_of(views, environments=on("cuda", np.array([0, 1])))):
         batch = renderer.render_batch(cameras, channels=("instance", "label"))
         for number, instance, label in ((0, 2, 6), (1, 1, 5)):
             ids = host(batch.instance)[number]
@@ -255,12 +237,6 @@ def test_cameras_of_an_environment_name_the_instances_of_the_scene():
     assert set(np.unique(host(batch.label))) == {-1, 8}
 
 
-def on_ids(ids):
-    import torch
-
-    return torch.tensor(ids, device="cuda")
-
-
 def test_pools_given_cuts_and_quantized_gaussians_have_channels(scene):
     camera = camera_at()
     expected = v3dg.render(scene, camera, channels=CHANNELS, device="cuda", memory=None)
@@ -269,16 +245,12 @@ def test_pools_given_cuts_and_quantized_gaussians_have_channels(scene):
     # Normals are found from covariances there.
     np.testing.assert_allclose(host(pooled.normal), host(expected.normal), atol=2e-3)
     cut = v3dg.select(scene, camera, device="cuda")
-    given = v3dg.render(scene, camera, cut=cut, channels=CHANNELS, device="cuda")
-    assert_same(given, expected)
+    image = v3dg.render(scene, camera, cut=cut, channels=CHANNELS, device="cuda")
+    assert_same(image, expected)
     coded = random_bundle(1, num_levels=3, sh_degree=1, codec="quantized")
     view = v3dg.first_camera(coded, WIDTH, HEIGHT)
-    drawn = [
-        v3dg.render(coded, view, channels=CHANNELS, device=device, tolerance=0.0)
-        for device in ("cuda", "cpu")
-    ]
-    assert_like_cpu(*drawn)
-    assert drawn[1].normal.any()
+    drawn = assert_devices_agree(coded, view, tolerance=0.0)
+    assert drawn.normal.any()
 
 
 def test_stereo_cameras_and_lenses_have_channels(scene):
@@ -289,12 +261,7 @@ def test_stereo_cameras_and_lenses_have_channels(scene):
     ):
         assert_like_cpu(eye, expected)
     lens = dataclasses.replace(camera_at(), distortion=(0.1, 0.01, 0.0, 0.0), model="OPENCV")
-    mesh = mesh_of((HEIGHT, WIDTH))
-    drawn = [
-        v3dg.render(scene, lens, channels=CHANNELS, mesh=mesh, device=device)
-        for device in ("cuda", "cpu")
-    ]
-    assert_like_cpu(*drawn)
+    assert_devices_agree(scene, lens, mesh=mesh_of((HEIGHT, WIDTH)))
 
 
 def test_planes_of_the_caller_are_written(scene):
