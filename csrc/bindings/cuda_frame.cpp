@@ -87,7 +87,8 @@ class BackendScene final : public backend::Scene {
         }
     };
 
-    static PoseSpan doubles_anywhere(const py::handle& array, const char* name, Shape shape) {
+    static PoseSpan doubles_anywhere(const py::handle& array, const char* name,
+                                     const Shape& shape) {
         if (device_of(array, name) == kHost)
             return {.values = span_of<const double>(array, name, shape), .is_on_device = false};
         const Borrowed borrowed = borrow_anywhere(array, name, element_of<double>(), shape);
@@ -409,8 +410,7 @@ class DeviceTape final : public Tape {
         const GradientPlane<float> alpha(d_alpha, "d_alpha", device, {h, w});
         const PictureGradient<float> d_picture{
             color.span.data, alpha.span.data,
-            d_depth.is_none() ? nullptr
-                              : span_on<const float>(device, d_depth, "d_depth", {h, w}).data};
+            elements_or_null<const float>(device, d_depth, "d_depth", {h, w})};
         const NewRows gradients(device, gaussians_.size(), gaussians_.sh_degree());
         const NewArray<float> background(device, {3});
         Gradients made{.means = gradients.means.object,

@@ -13,7 +13,7 @@ inline cudaStream_t stream_of(const Work& work) { return static_cast<cudaStream_
 
 // Borrows an array that is on any CUDA device.
 Borrowed borrow_anywhere(const py::handle& array, const char* name, const Element& element,
-                         Shape shape);
+                         const Shape& shape);
 
 class BackendTables final : public backend::Tables {
   public:

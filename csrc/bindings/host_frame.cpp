@@ -364,7 +364,7 @@ class HostTape final : public Tape {
         const GradientPlane<T> alpha(d_alpha, "d_alpha", kHost, {h, w});
         const PictureGradient<T> d_picture{
             color.span.data, alpha.span.data,
-            d_depth.is_none() ? nullptr : span_of<const T>(d_depth, "d_depth", {h, w}).data};
+            elements_or_null<const T>(kHost, d_depth, "d_depth", {h, w})};
         const auto n = static_cast<py::ssize_t>(model_.size());
         const int degree = model_.planes().sh_degree;
         Gradients made;

@@ -78,15 +78,11 @@ struct ViewsGradientPlanes {
     const T* depth;
     size_t num_pixels;
 
-    ViewsGradientPlanes(Device device, const std::vector<py::ssize_t>& shape,
-                        const py::object& d_color, const py::object& d_alpha,
-                        const py::object& d_depth)
+    ViewsGradientPlanes(Device device, const Shape& shape, const py::object& d_color,
+                        const py::object& d_alpha, const py::object& d_depth)
         : color(d_color, "d_color", device, {shape[0], shape[1], shape[2], 3}),
           alpha(d_alpha, "d_alpha", device, shape),
-          depth(d_depth.is_none()
-                    ? nullptr
-                    : span_on<const T>(device, d_depth, "d_depth", {shape[0], shape[1], shape[2]})
-                          .data),
+          depth(elements_or_null<const T>(device, d_depth, "d_depth", shape)),
           num_pixels(static_cast<size_t>(shape[1]) * static_cast<size_t>(shape[2])) {}
 
     PictureGradient<T> of_view(size_t view) const {
