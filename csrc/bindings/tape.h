@@ -46,6 +46,9 @@ struct DrawLook {
     }
 };
 
+// Throws ValueError unless gaussians have coefficients of degree 0, as plain colours do.
+void check_plain_colors(const Rows& gaussians);
+
 // A drawn picture. `counts` are set on the host only; `tape` is null if not requested.
 struct Rasterized {
     py::object color, alpha, depth;
