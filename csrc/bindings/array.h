@@ -133,6 +133,14 @@ struct NewArray {
     }
 };
 
+// Makes an array, which `object` then is, and returns its elements, uninitialised.
+template <class T>
+T* new_elements(Device device, const Shape& shape, py::object& object) {
+    const NewArray<T> array(device, shape);
+    object = array.object;
+    return array.span.data;
+}
+
 class Backend;
 
 // A scope in which work runs on a device: the device is current, and work is enqueued

@@ -139,15 +139,11 @@ BoundPlanes::BoundPlanes(const BoundCameras& cameras, Device device, bool with_d
       count_(static_cast<py::ssize_t>(cameras.size())),
       height_(cameras.height()),
       width_(cameras.width()) {
-    const NewArray<float> color(device, {count_, height_, width_, 3});
-    const NewArray<float> alpha(device, {count_, height_, width_});
-    color_ = color.object;
-    alpha_ = alpha.object;
-    planes_ = {.color = color.span.data, .channels = 3, .alpha = alpha.span.data, .depth = nullptr};
-    if (!with_depth) return;
-    const NewArray<float> depth(device, {count_, height_, width_});
-    depth_ = depth.object;
-    planes_.depth = depth.span.data;
+    const Shape of_plane{count_, height_, width_};
+    planes_.channels = 3;
+    planes_.color = new_elements<float>(device, {count_, height_, width_, 3}, color_);
+    planes_.alpha = new_elements<float>(device, of_plane, alpha_);
+    if (with_depth) planes_.depth = new_elements<float>(device, of_plane, depth_);
 }
 
 void BoundPlanes::check(const BoundCameras& cameras, Device device) const {

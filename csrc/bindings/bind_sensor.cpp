@@ -26,10 +26,7 @@ SensorPlanes NewChannels::allocate(Device device, const Channels& channels,
     with_axes.push_back(3);
     const auto made = [&]<class T>(bool is_wanted, const std::vector<py::ssize_t>& of_plane,
                                    py::object& object, T*& plane) {
-        if (!is_wanted || plane != nullptr) return;
-        const NewArray<T> array(device, of_plane);
-        object = array.object;
-        plane = array.span.data;
+        if (is_wanted && plane == nullptr) plane = new_elements<T>(device, of_plane, object);
     };
     made(channels.median_depth, shape, median_depth, planes.median_depth);
     made(channels.normal, with_axes, normal, planes.normal);

@@ -420,9 +420,11 @@ class DeviceTape final : public Tape {
                        .sh = gradients.sh.object,
                        .background = background.object};
         CenterGradients<float> centers{};
-        if (wanted.sum) centers.sum = new_pairs(made.centers);
+        const Shape pairs{static_cast<py::ssize_t>(gaussians_.size()), 2};
+        if (wanted.sum) centers.sum = new_elements<float>(device, pairs, made.centers);
         if (wanted.size)
-            centers.size = reinterpret_cast<CenterSize<float>*>(new_pairs(made.center_sizes));
+            centers.size = reinterpret_cast<CenterSize<float>*>(
+                new_elements<float>(device, pairs, made.center_sizes));
         {
             const Unlocked unlocked;
             frame_->backward(d_picture, gradients.rows(), centers, background.span.data,
@@ -432,13 +434,6 @@ class DeviceTape final : public Tape {
     }
 
   private:
-    float* new_pairs(py::object& object) const {
-        const NewArray<float> array(gaussians_.device(),
-                                    {static_cast<py::ssize_t>(gaussians_.size()), 2});
-        object = array.object;
-        return array.span.data;
-    }
-
     Rows gaussians_;
     std::unique_ptr<DifferentiableFrame> frame_;
     py::ssize_t height_, width_;
