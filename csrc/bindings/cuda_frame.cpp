@@ -110,6 +110,13 @@ const DeviceModel& model_on_device(const backend::Model& model) {
     return static_cast<const BackendModel&>(model).on_device();
 }
 
+FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& planes) {
+    const std::array<double, 3>& color = shade.background;
+    const float background[3] = {float(color[0]), float(color[1]), float(color[2])};
+    return frame_image(eye.intrinsics<float>(), static_cast<int>(eye.width),
+                       static_cast<int>(eye.height), background, planes);
+}
+
 namespace {
 
 class BackendPool final : public backend::Pool {
@@ -232,13 +239,6 @@ CameraArrays arrays_of(const BoundCameras& cameras) {
             .width = cameras.width(),
             .height = cameras.height(),
             .near_depth = cameras.near_depth()};
-}
-
-FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& planes = {}) {
-    const std::array<double, 3>& color = shade.background;
-    const float background[3] = {float(color[0]), float(color[1]), float(color[2])};
-    return frame_image(eye.intrinsics<float>(), static_cast<int>(eye.width),
-                       static_cast<int>(eye.height), background, planes);
 }
 
 PicturePlanes planes_of(NewPicture& picture, Device device) {

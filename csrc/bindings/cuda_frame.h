@@ -45,6 +45,9 @@ std::unique_ptr<backend::RayFrame> make_ray_frame();
 const SceneTables& tables_of(const backend::Scene& scene);
 const DeviceModel& model_on_device(const backend::Model& model);
 
+// Returns the image of a camera.
+FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& planes = {});
+
 // Implements Backend::rasterize().
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);

@@ -74,17 +74,12 @@ ViewsInput input_of(const std::vector<Rows>& gaussians, const std::vector<Camera
         if (view == first || gaussians.size() > 1)
             in.models.push_back(of_view.read<float>(gaussians[gaussians.size() > 1 ? view : 0]));
         in.views.push_back(view_of_world<float>(camera));
-        const auto width = static_cast<int>(camera.width);
-        const auto height = static_cast<int>(camera.height);
-        const size_t skipped = view * static_cast<size_t>(width) * static_cast<size_t>(height);
-        const float background[3] = {static_cast<float>(of_view.background[0]),
-                                     static_cast<float>(of_view.background[1]),
-                                     static_cast<float>(of_view.background[2])};
+        const size_t skipped =
+            view * static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height);
         const PicturePlanes planes{
             made.color_plane + 3 * skipped, made.alpha_plane + skipped,
             made.depth_plane == nullptr ? nullptr : made.depth_plane + skipped, false};
-        FrameImage image =
-            frame_image(camera.intrinsics<float>(), width, height, background, planes);
+        FrameImage image = image_of(camera, Shade{.background = of_view.background}, planes);
         image.first_tile = static_cast<uint32_t>(view - first) * num_tiles_of(image);
         in.images.push_back(image);
     }
