@@ -24,7 +24,7 @@ void refuse_kind(const char* name, const std::string& expected, const py::handle
                          text_of(py::type::handle_of(got)));
 }
 
-std::string shape_text(Shape shape) {
+std::string shape_text(const Shape& shape) {
     std::string text;
     for (const py::ssize_t length : shape)
         text +=
@@ -36,7 +36,7 @@ std::string shape_text(const py::handle& array) {
     return text_of(py::tuple(py::getattr(array, "shape", py::tuple())));
 }
 
-bool fits_shape(const std::vector<py::ssize_t>& got, Shape wanted) {
+bool fits_shape(const std::vector<py::ssize_t>& got, const Shape& wanted) {
     if (got.size() != wanted.size()) return false;
     size_t axis = 0;
     for (const py::ssize_t length : wanted)
@@ -71,7 +71,7 @@ Device device_of(const py::handle& array, const char* name) {
 }
 
 Borrowed borrow_on_host(const py::handle& array, const char* name, const Element& element,
-                        Shape shape, bool is_written) {
+                        const Shape& shape, bool is_written) {
     if (!py::isinstance<py::array>(array)) refuse_kind(name, "a NumPy array", array);
     const auto got = py::reinterpret_borrow<py::array>(array);
     const py::dtype dtype = element.dtype();
@@ -89,7 +89,7 @@ Borrowed borrow_on_host(const py::handle& array, const char* name, const Element
 }
 
 Borrowed borrow(Device device, const py::handle& array, const char* name, const Element& element,
-                Shape shape, bool is_written) {
+                const Shape& shape, bool is_written) {
     return backend_of(device).borrow(device, array, name, element, shape, is_written);
 }
 

@@ -9,7 +9,6 @@
 #include <pybind11/stl.h>
 
 #include <cstdint>
-#include <initializer_list>
 #include <string>
 #include <type_traits>
 #include <utility>
@@ -25,8 +24,8 @@ namespace py = pybind11;
 using namespace py::literals;
 
 // An expected shape; -1 means any length.
-using Shape = std::initializer_list<py::ssize_t>;
-std::string shape_text(Shape shape);
+using Shape = std::vector<py::ssize_t>;
+std::string shape_text(const Shape& shape);
 std::string shape_text(const py::handle& array);
 
 // Throws TypeError with the text "name: expected ..., got ...".
@@ -75,23 +74,23 @@ Device device_of(const py::handle& array, const char* name);
 // Returns the attribute __cuda_array_interface__ of an array, or None if there is none.
 py::object cuda_interface_of(const py::handle& array);
 
-bool fits_shape(const std::vector<py::ssize_t>& got, Shape wanted);
+bool fits_shape(const std::vector<py::ssize_t>& got, const Shape& wanted);
 
 // Throws ValueError with the text "name: problem".
 [[noreturn]] void refuse_value(const char* name, const std::string& problem);
 
 // Borrows a NumPy array after checks of its dtype and shape.
 Borrowed borrow_on_host(const py::handle& array, const char* name, const Element& element,
-                        Shape shape, bool is_written);
+                        const Shape& shape, bool is_written);
 
 // Borrows an array after checks of its device, dtype and shape. The caller must keep
 // the array alive, and order its work on the array's stream.
 Borrowed borrow(Device device, const py::handle& array, const char* name, const Element& element,
-                Shape shape, bool is_written);
+                const Shape& shape, bool is_written);
 
 // Borrows a NumPy array. A const T means that the array is only read.
 template <class T>
-Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
+Span<T> span_of(const py::handle& array, const char* name, const Shape& shape) {
     const Borrowed borrowed = borrow_on_host(array, name, element_of<std::remove_const_t<T>>(),
                                              shape, !std::is_const_v<T>);
     return {static_cast<T*>(borrowed.data), borrowed.size};
@@ -99,10 +98,16 @@ Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
 
 // Borrows an array, which must be on this device.
 template <class T>
-Span<T> span_on(Device device, const py::handle& array, const char* name, Shape shape) {
+Span<T> span_on(Device device, const py::handle& array, const char* name, const Shape& shape) {
     const Borrowed borrowed = borrow(device, array, name, element_of<std::remove_const_t<T>>(),
                                      shape, !std::is_const_v<T>);
     return {static_cast<T*>(borrowed.data), borrowed.size};
+}
+
+// Borrows an array like span_on(), and returns its elements; null for None.
+template <class T>
+T* elements_or_null(Device device, const py::object& array, const char* name, const Shape& shape) {
+    return array.is_none() ? nullptr : span_on<T>(device, array, name, shape).data;
 }
 
 // A new, uninitialised array, and its memory. make_array() throws MemoryError if there
@@ -127,6 +132,14 @@ struct NewArray {
         span = {static_cast<T*>(made.data), size};
     }
 };
+
+// Makes an array, which `object` then is, and returns its elements, uninitialised.
+template <class T>
+T* new_elements(Device device, const Shape& shape, py::object& object) {
+    const NewArray<T> array(device, shape);
+    object = array.object;
+    return array.span.data;
+}
 
 class Backend;
 

@@ -254,7 +254,7 @@ class Backend {
     virtual std::optional<Device> device_of(const py::handle& array) const = 0;
     // Borrows an array after checks of its kind, dtype, shape, layout and device.
     virtual Borrowed borrow(Device device, const py::handle& array, const char* name,
-                            const Element& element, Shape shape, bool is_written) const = 0;
+                            const Element& element, const Shape& shape, bool is_written) const = 0;
     // Returns a new, uninitialised array.
     virtual MadeArray make_array(Device device, const Element& element,
                                  const std::vector<py::ssize_t>& shape) const = 0;

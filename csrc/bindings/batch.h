@@ -21,7 +21,7 @@ struct Reals {
 };
 
 // Borrows an array of float64 or, on a device, of float32.
-Reals reals_of(Device device, const py::object& array, const char* name, Shape shape);
+Reals reals_of(Device device, const py::object& array, const char* name, const Shape& shape);
 
 // B cameras of one size. The arrays are on the host or on one device. They are read
 // when a batch is drawn, so they may change in place between batches.
@@ -82,10 +82,6 @@ class BoundPlanes {
     void check(const BoundCameras& cameras, Device device) const;
 
   private:
-    // Returns a plane of the caller with numbers of one type; null for None.
-    template <class T>
-    T* plane_of(const py::object& array, const char* name) const;
-
     py::object color_, alpha_, depth_;
     NewChannels channels_;
     Device device_;

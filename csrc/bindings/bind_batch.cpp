@@ -40,7 +40,7 @@ py::object fault_of_cameras(const py::array& viewmats, const py::array& K) {
 
 }  // namespace
 
-Reals reals_of(Device device, const py::object& array, const char* name, Shape shape) {
+Reals reals_of(Device device, const py::object& array, const char* name, const Shape& shape) {
     if (device != kHost && has_dtype(array, "float32"))
         return {.data = span_on<const float>(device, array, name, shape).data, .are_double = false};
     return {.data = span_on<const double>(device, array, name, shape).data, .are_double = true};
@@ -96,12 +96,6 @@ std::vector<Camera> BoundCameras::on_host() const {
     return cameras;
 }
 
-template <class T>
-T* BoundPlanes::plane_of(const py::object& array, const char* name) const {
-    if (array.is_none()) return nullptr;
-    return span_on<T>(device_, array, name, {count_, height_, width_}).data;
-}
-
 BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth, NewChannels channels)
     : color_(std::move(color)),
       alpha_(std::move(alpha)),
@@ -121,17 +115,22 @@ BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth, N
         refuse_value("alpha", "colour has alpha as its fourth channel; leave it out");
     planes_.color =
         span_on<float>(device_, color_, "color", {count_, height_, width_, shape[3]}).data;
-    planes_.alpha = plane_of<float>(alpha_, "alpha");
-    planes_.depth = plane_of<float>(depth_, "depth");
-    sensor_planes_ = {.median_depth = plane_of<float>(channels_.median_depth, "median_depth"),
-                      .normal = nullptr,
-                      .instance = plane_of<int32_t>(channels_.instance, "instance"),
-                      .label = plane_of<int32_t>(channels_.label, "label"),
-                      .weight = plane_of<float>(channels_.weight, "weight"),
+    const Shape of_plane{count_, height_, width_};
+    const Shape with_axes{count_, height_, width_, 3};
+    const auto floats = [&](const py::object& array, const char* name, const Shape& wanted) {
+        return elements_or_null<float>(device_, array, name, wanted);
+    };
+    const auto ints = [&](const py::object& array, const char* name) {
+        return elements_or_null<int32_t>(device_, array, name, of_plane);
+    };
+    planes_.alpha = floats(alpha_, "alpha", of_plane);
+    planes_.depth = floats(depth_, "depth", of_plane);
+    sensor_planes_ = {.median_depth = floats(channels_.median_depth, "median_depth", of_plane),
+                      .normal = floats(channels_.normal, "normal", with_axes),
+                      .instance = ints(channels_.instance, "instance"),
+                      .label = ints(channels_.label, "label"),
+                      .weight = floats(channels_.weight, "weight", of_plane),
                       .clipped = nullptr};
-    if (!channels_.normal.is_none())
-        sensor_planes_.normal =
-            span_on<float>(device_, channels_.normal, "normal", {count_, height_, width_, 3}).data;
 }
 
 BoundPlanes::BoundPlanes(const BoundCameras& cameras, Device device, bool with_depth)
@@ -140,15 +139,11 @@ BoundPlanes::BoundPlanes(const BoundCameras& cameras, Device device, bool with_d
       count_(static_cast<py::ssize_t>(cameras.size())),
       height_(cameras.height()),
       width_(cameras.width()) {
-    const NewArray<float> color(device, {count_, height_, width_, 3});
-    const NewArray<float> alpha(device, {count_, height_, width_});
-    color_ = color.object;
-    alpha_ = alpha.object;
-    planes_ = {.color = color.span.data, .channels = 3, .alpha = alpha.span.data, .depth = nullptr};
-    if (!with_depth) return;
-    const NewArray<float> depth(device, {count_, height_, width_});
-    depth_ = depth.object;
-    planes_.depth = depth.span.data;
+    const Shape of_plane{count_, height_, width_};
+    planes_.channels = 3;
+    planes_.color = new_elements<float>(device, {count_, height_, width_, 3}, color_);
+    planes_.alpha = new_elements<float>(device, of_plane, alpha_);
+    if (with_depth) planes_.depth = new_elements<float>(device, of_plane, depth_);
 }
 
 void BoundPlanes::check(const BoundCameras& cameras, Device device) const {

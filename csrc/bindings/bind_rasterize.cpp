@@ -60,11 +60,15 @@ BoundEllipses ellipses(const Rows& gaussians, const BoundCamera& camera, double 
 
 }  // namespace
 
+void check_plain_colors(const Rows& gaussians) {
+    if (gaussians.sh_degree() != 0)
+        refuse_value("sh", "expected shape (N, 1, 3) for plain colours, got degree " +
+                               std::to_string(gaussians.sh_degree()));
+}
+
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape) {
-    if (look.plain_colors && gaussians.sh_degree() != 0)
-        throw py::value_error("sh: expected shape (N, 1, 3) for plain colours, got degree " +
-                              std::to_string(gaussians.sh_degree()));
+    if (look.plain_colors) check_plain_colors(gaussians);
     return backend_of(gaussians.device()).rasterize(gaussians, camera, look, with_depth, keep_tape);
 }
 

@@ -54,11 +54,9 @@ using GivenRule = std::optional<std::array<float, 2>>;
 // the returns; otherwise colour and mean range.
 RayPlanes make_planes(Device device, py::ssize_t count, const RayGrid& grid, const GivenRule& rule,
                       BoundCast& made) {
-    const std::vector<py::ssize_t> shape{count, grid.num_rows(), grid.num_columns()};
+    const Shape shape{count, grid.num_rows(), grid.num_columns()};
     const auto plane = [&](py::object& object) {
-        const NewArray<float> array(device, shape);
-        object = array.object;
-        return array.span.data;
+        return new_elements<float>(device, shape, object);
     };
     RayPlanes planes{};
     planes.alpha = plane(made.alpha);
@@ -71,9 +69,7 @@ RayPlanes make_planes(Device device, py::ssize_t count, const RayGrid& grid, con
         return planes;
     }
     planes.range = plane(made.range);
-    const NewArray<float> color(device, {count, shape[1], shape[2], 3});
-    made.color = color.object;
-    planes.color = color.span.data;
+    planes.color = new_elements<float>(device, {count, shape[1], shape[2], 3}, made.color);
     return planes;
 }
 

@@ -18,22 +18,6 @@ bool& channel_of(Channels& channels, const std::string& name) {
     throw py::value_error("channels: expected names of channels, got '" + name + "'");
 }
 
-// Borrows a plane of a mesh with `channels` numbers a pixel. `channels` is 0 for a
-// plane without an axis of channels. Returns null for None.
-template <class T>
-const T* plane_of(Device device, const py::object& array, const char* name,
-                  const std::vector<py::ssize_t>& shape, py::ssize_t channels) {
-    if (array.is_none()) return nullptr;
-    const py::ssize_t a = shape[0], b = shape[1];
-    if (shape.size() == 2) {
-        if (channels == 0) return span_on<const T>(device, array, name, {a, b}).data;
-        return span_on<const T>(device, array, name, {a, b, channels}).data;
-    }
-    const py::ssize_t c = shape[2];
-    if (channels == 0) return span_on<const T>(device, array, name, {a, b, c}).data;
-    return span_on<const T>(device, array, name, {a, b, c, channels}).data;
-}
-
 }  // namespace
 
 SensorPlanes NewChannels::allocate(Device device, const Channels& channels,
@@ -42,10 +26,7 @@ SensorPlanes NewChannels::allocate(Device device, const Channels& channels,
     with_axes.push_back(3);
     const auto made = [&]<class T>(bool is_wanted, const std::vector<py::ssize_t>& of_plane,
                                    py::object& object, T*& plane) {
-        if (!is_wanted || plane != nullptr) return;
-        const NewArray<T> array(device, of_plane);
-        object = array.object;
-        plane = array.span.data;
+        if (is_wanted && plane == nullptr) plane = new_elements<T>(device, of_plane, object);
     };
     made(channels.median_depth, shape, median_depth, planes.median_depth);
     made(channels.normal, with_axes, normal, planes.normal);
@@ -64,12 +45,20 @@ BoundMesh::BoundMesh(py::object color, py::object depth, py::object coverage, py
       device_(device_of(arrays_[1], "depth")) {
     if (shape_.size() != 2 && shape_.size() != 3)
         refuse_value("depth", "expected shape (H, W) or (B, H, W), got " + shape_text(arrays_[1]));
-    layer_.color = plane_of<float>(device_, arrays_[0], "color", shape_, 3);
-    layer_.depth = plane_of<float>(device_, arrays_[1], "depth", shape_, 0);
-    layer_.coverage = plane_of<float>(device_, arrays_[2], "coverage", shape_, 0);
-    layer_.normal = plane_of<float>(device_, arrays_[3], "normal", shape_, 3);
-    layer_.instance = plane_of<int32_t>(device_, arrays_[4], "instance", shape_, 0);
-    layer_.label = plane_of<int32_t>(device_, arrays_[5], "label", shape_, 0);
+    Shape with_axes = shape_;
+    with_axes.push_back(3);
+    const auto floats = [&](const py::object& array, const char* name, const Shape& wanted) {
+        return elements_or_null<const float>(device_, array, name, wanted);
+    };
+    const auto ints = [&](const py::object& array, const char* name) {
+        return elements_or_null<const int32_t>(device_, array, name, shape_);
+    };
+    layer_.color = floats(arrays_[0], "color", with_axes);
+    layer_.depth = floats(arrays_[1], "depth", shape_);
+    layer_.coverage = floats(arrays_[2], "coverage", shape_);
+    layer_.normal = floats(arrays_[3], "normal", with_axes);
+    layer_.instance = ints(arrays_[4], "instance");
+    layer_.label = ints(arrays_[5], "label");
     if (layer_.color == nullptr)
         throw py::value_error("mesh: expected an array of colour, got None");
     if (layer_.coverage == nullptr && device_ == kHost)
@@ -79,13 +68,8 @@ BoundMesh::BoundMesh(py::object color, py::object depth, py::object coverage, py
 
 void BoundMesh::check(const std::vector<py::ssize_t>& shape) const {
     if (shape_ == shape) return;
-    std::string expected;
-    for (const py::ssize_t size : shape) {
-        if (!expected.empty()) expected += ", ";
-        expected += std::to_string(size);
-    }
-    refuse_value("mesh", "expected planes of shape (" + expected + "), as the picture has, got " +
-                             shape_text(arrays_[1]));
+    refuse_value("mesh", "expected planes of shape " + shape_text(shape) +
+                             ", as the picture has, got " + shape_text(arrays_[1]));
 }
 
 BoundSensor::BoundSensor(const std::vector<std::string>& channels, py::object mesh)

@@ -30,9 +30,7 @@ void check_views(const std::vector<Rows>& gaussians, const BoundCameras& cameras
                               rows.is_double() == first.is_double();
         if (!is_alike) refuse_value("gaussians", "expected as many of one kind for each camera");
     }
-    if (look.plain_colors && gaussians[0].sh_degree() != 0)
-        refuse_value("sh", "expected shape (N, 1, 3) for plain colours, got degree " +
-                               std::to_string(gaussians[0].sh_degree()));
+    if (look.plain_colors) check_plain_colors(gaussians[0]);
 }
 
 template <class T>

@@ -17,7 +17,7 @@ namespace v3dg {
 namespace cuda {
 
 Borrowed borrow_anywhere(const py::handle& array, const char* name, const Element& element,
-                         Shape shape) {
+                         const Shape& shape) {
     const py::object found = cuda_interface_of(array);
     if (found.is_none()) refuse_kind(name, "an array on a CUDA device", array);
     const py::dict face(found);
@@ -145,7 +145,7 @@ class CudaBackend final : public Backend {
     }
 
     Borrowed borrow(Device device, const py::handle& array, const char* name,
-                    const Element& element, Shape shape, bool) const override {
+                    const Element& element, const Shape& shape, bool) const override {
         const Borrowed borrowed = borrow_anywhere(array, name, element, shape);
         check_is_on(device, borrowed.data, name);
         return borrowed;

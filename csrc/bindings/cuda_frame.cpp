@@ -87,7 +87,8 @@ class BackendScene final : public backend::Scene {
         }
     };
 
-    static PoseSpan doubles_anywhere(const py::handle& array, const char* name, Shape shape) {
+    static PoseSpan doubles_anywhere(const py::handle& array, const char* name,
+                                     const Shape& shape) {
         if (device_of(array, name) == kHost)
             return {.values = span_of<const double>(array, name, shape), .is_on_device = false};
         const Borrowed borrowed = borrow_anywhere(array, name, element_of<double>(), shape);
@@ -107,6 +108,13 @@ const SceneTables& tables_of(const backend::Scene& scene) {
 
 const DeviceModel& model_on_device(const backend::Model& model) {
     return static_cast<const BackendModel&>(model).on_device();
+}
+
+FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& planes) {
+    const std::array<double, 3>& color = shade.background;
+    const float background[3] = {float(color[0]), float(color[1]), float(color[2])};
+    return frame_image(eye.intrinsics<float>(), static_cast<int>(eye.width),
+                       static_cast<int>(eye.height), background, planes);
 }
 
 namespace {
@@ -231,13 +239,6 @@ CameraArrays arrays_of(const BoundCameras& cameras) {
             .width = cameras.width(),
             .height = cameras.height(),
             .near_depth = cameras.near_depth()};
-}
-
-FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& planes = {}) {
-    const std::array<double, 3>& color = shade.background;
-    const float background[3] = {float(color[0]), float(color[1]), float(color[2])};
-    return frame_image(eye.intrinsics<float>(), static_cast<int>(eye.width),
-                       static_cast<int>(eye.height), background, planes);
 }
 
 PicturePlanes planes_of(NewPicture& picture, Device device) {
@@ -409,8 +410,7 @@ class DeviceTape final : public Tape {
         const GradientPlane<float> alpha(d_alpha, "d_alpha", device, {h, w});
         const PictureGradient<float> d_picture{
             color.span.data, alpha.span.data,
-            d_depth.is_none() ? nullptr
-                              : span_on<const float>(device, d_depth, "d_depth", {h, w}).data};
+            elements_or_null<const float>(device, d_depth, "d_depth", {h, w})};
         const NewRows gradients(device, gaussians_.size(), gaussians_.sh_degree());
         const NewArray<float> background(device, {3});
         Gradients made{.means = gradients.means.object,
@@ -420,9 +420,11 @@ class DeviceTape final : public Tape {
                        .sh = gradients.sh.object,
                        .background = background.object};
         CenterGradients<float> centers{};
-        if (wanted.sum) centers.sum = new_pairs(made.centers);
+        const Shape pairs{static_cast<py::ssize_t>(gaussians_.size()), 2};
+        if (wanted.sum) centers.sum = new_elements<float>(device, pairs, made.centers);
         if (wanted.size)
-            centers.size = reinterpret_cast<CenterSize<float>*>(new_pairs(made.center_sizes));
+            centers.size = reinterpret_cast<CenterSize<float>*>(
+                new_elements<float>(device, pairs, made.center_sizes));
         {
             const Unlocked unlocked;
             frame_->backward(d_picture, gradients.rows(), centers, background.span.data,
@@ -432,13 +434,6 @@ class DeviceTape final : public Tape {
     }
 
   private:
-    float* new_pairs(py::object& object) const {
-        const NewArray<float> array(gaussians_.device(),
-                                    {static_cast<py::ssize_t>(gaussians_.size()), 2});
-        object = array.object;
-        return array.span.data;
-    }
-
     Rows gaussians_;
     std::unique_ptr<DifferentiableFrame> frame_;
     py::ssize_t height_, width_;

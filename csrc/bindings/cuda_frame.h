@@ -13,7 +13,7 @@ inline cudaStream_t stream_of(const Work& work) { return static_cast<cudaStream_
 
 // Borrows an array that is on any CUDA device.
 Borrowed borrow_anywhere(const py::handle& array, const char* name, const Element& element,
-                         Shape shape);
+                         const Shape& shape);
 
 class BackendTables final : public backend::Tables {
   public:
@@ -44,6 +44,9 @@ std::unique_ptr<backend::RayFrame> make_ray_frame();
 // Return the memory of handles.
 const SceneTables& tables_of(const backend::Scene& scene);
 const DeviceModel& model_on_device(const backend::Model& model);
+
+// Returns the image of a camera.
+FrameImage image_of(const Camera& eye, const Shade& shade, const PicturePlanes& planes = {});
 
 // Implements Backend::rasterize().
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,

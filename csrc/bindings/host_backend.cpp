@@ -85,7 +85,7 @@ class HostBackend final : public Backend {
         return kHost;
     }
     Borrowed borrow(Device, const py::handle& array, const char* name, const Element& element,
-                    Shape shape, bool is_written) const override {
+                    const Shape& shape, bool is_written) const override {
         return borrow_on_host(array, name, element, shape, is_written);
     }
     MadeArray make_array(Device, const Element& element,

@@ -364,22 +364,22 @@ class HostTape final : public Tape {
         const GradientPlane<T> alpha(d_alpha, "d_alpha", kHost, {h, w});
         const PictureGradient<T> d_picture{
             color.span.data, alpha.span.data,
-            d_depth.is_none() ? nullptr : span_of<const T>(d_depth, "d_depth", {h, w}).data};
+            elements_or_null<const T>(kHost, d_depth, "d_depth", {h, w})};
         const auto n = static_cast<py::ssize_t>(model_.size());
         const int degree = model_.planes().sh_degree;
         Gradients made;
-        const GaussianRows<T> out{.means = zeros({n, 3}, made.means),
-                                  .quats = zeros({n, 4}, made.quats),
-                                  .scales = zeros({n, 3}, made.scales),
-                                  .opacities = zeros({n}, made.opacities),
-                                  .sh = zeros({n, num_sh_bases(degree), 3}, made.sh),
+        const GaussianRows<T> out{.means = zeros<T>({n, 3}, made.means),
+                                  .quats = zeros<T>({n, 4}, made.quats),
+                                  .scales = zeros<T>({n, 3}, made.scales),
+                                  .opacities = zeros<T>({n}, made.opacities),
+                                  .sh = zeros<T>({n, num_sh_bases(degree), 3}, made.sh),
                                   .size = model_.size(),
                                   .sh_degree = degree};
-        T* const background = zeros({3}, made.background);
+        T* const background = zeros<T>({3}, made.background);
         CenterGradients<T> centers{};
-        if (wanted.sum) centers.sum = zeros({n, 2}, made.centers);
+        if (wanted.sum) centers.sum = zeros<T>({n, 2}, made.centers);
         if (wanted.size)
-            centers.size = reinterpret_cast<CenterSize<T>*>(zeros({n, 2}, made.center_sizes));
+            centers.size = reinterpret_cast<CenterSize<T>*>(zeros<T>({n, 2}, made.center_sizes));
         {
             const Unlocked unlocked;
             const Picture<T> picture{
@@ -395,13 +395,6 @@ class HostTape final : public Tape {
     }
 
   private:
-    static T* zeros(const std::vector<py::ssize_t>& shape, py::object& object) {
-        const NewArray<T> array(kHost, shape);
-        std::fill(array.span.begin(), array.span.end(), T(0));
-        object = array.object;
-        return array.span.data;
-    }
-
     ::v3dg::Model<T> model_;
     Draw<T> draw_;
     Intrinsics<T> camera_;

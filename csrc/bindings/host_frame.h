@@ -2,6 +2,8 @@
 
 // Models, palettes, pools and frames on the host.
 
+#include <algorithm>
+
 #include "bindings/resident.h"
 #include "draw/model.h"
 
@@ -48,6 +50,15 @@ std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const back
                                                       Appearance<float> appearance);
 
 std::unique_ptr<backend::RayFrame> make_ray_frame();
+
+// Makes an array like new_elements(), of zeros.
+template <class T>
+T* zeros(const Shape& shape, py::object& object) {
+    const NewArray<T> array(kHost, shape);
+    std::fill(array.span.begin(), array.span.end(), T(0));
+    object = array.object;
+    return array.span.data;
+}
 
 // Implements Backend::rasterize() for float32 and float64.
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,

@@ -39,8 +39,7 @@ class HostRayFrame final : public backend::RayFrame {
         std::vector<int64_t> gaussians;
         for (size_t pose = 0; pose < input.num_poses; ++pose)
             gaussians.push_back(cpu::cast_scene(scene, input.sensor, camera_at(input, pose),
-                                                input.rule, planes_at(input, pose))
-                                    .gaussians);
+                                                input.rule, planes_at(input, pose)));
         return gaussians;
     }
 

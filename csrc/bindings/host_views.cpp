@@ -3,20 +3,13 @@
 #include <algorithm>
 
 #include "base/parallel_for.h"
+#include "bindings/host_frame.h"
 #include "bindings/views.h"
 #include "draw/model.h"
 
 namespace v3dg::host {
 
 namespace {
-
-template <class T>
-T* zeros(const std::vector<py::ssize_t>& shape, py::object& object) {
-    const NewArray<T> array(kHost, shape);
-    std::fill(array.span.begin(), array.span.end(), T(0));
-    object = array.object;
-    return array.span.data;
-}
 
 template <class T>
 class HostViewsTape final : public ViewsTape {
@@ -52,43 +45,15 @@ class HostViewsTape final : public ViewsTape {
         const auto num_views = static_cast<py::ssize_t>(cameras_.size());
         const ViewsGradientPlanes<T> planes(kHost, {num_views, height(), width()}, d_color, d_alpha,
                                             d_depth);
-        const auto n = static_cast<py::ssize_t>(models_[0]->size());
-        const int degree = models_[0]->planes().sh_degree;
-        const py::ssize_t bases = num_sh_bases(degree);
-        const auto shape = [&](bool for_each_view, std::vector<py::ssize_t> of_view) {
-            if (for_each_view) of_view.insert(of_view.begin(), num_views);
-            return of_view;
-        };
         Gradients made;
-        const GaussianRows<T> sums{
-            .means = zeros<T>({n, 3}, made.means),
-            .quats = zeros<T>({n, 4}, made.quats),
-            .scales = zeros<T>({n, 3}, made.scales),
-            .opacities = zeros<T>(shape(wanted.opacities_for_each_view, {n}), made.opacities),
-            .sh = zeros<T>(shape(wanted.sh_for_each_view, {n, bases, 3}), made.sh),
-            .size = models_[0]->size(),
-            .sh_degree = degree};
-        T* const background = zeros<T>({num_views, 3}, made.background);
-        CenterGradients<T> centers{};
-        if (wanted.centers.sum) centers.sum = zeros<T>({num_views, n, 2}, made.centers);
-        if (wanted.centers.size)
-            centers.size =
-                reinterpret_cast<CenterSize<T>*>(zeros<T>({num_views, n, 2}, made.center_sizes));
-        T* const poses = wanted.poses ? zeros<T>({num_views, 3, 4}, made.poses) : nullptr;
+        const NewViewsGradients<T> sums(models_[0]->size(), models_[0]->planes().sh_degree,
+                                        num_views, wanted, made, zeros<T>);
         const Unlocked unlocked;
-        add_views({.rows = sums, .centers = centers, .background = background, .poses = poses},
-                  wanted, planes);
+        add_views(sums, wanted, planes);
         return made;
     }
 
   private:
-    // The gradients of all views.
-    struct Sums {
-        GaussianRows<T> rows;
-        CenterGradients<T> centers;
-        T *background, *poses;
-    };
-
     // Rows of gradients that are summed over the views, for one view.
     class Scratch {
       public:
@@ -126,7 +91,7 @@ class HostViewsTape final : public ViewsTape {
     // Adds the gradients of all views in their order. If gaussians are few, each thread
     // computes a view, whose rows are then added. All threads together compute the views
     // that are left over.
-    void add_views(const Sums& sums, const ViewsWanted& wanted,
+    void add_views(const NewViewsGradients<T>& sums, const ViewsWanted& wanted,
                    const ViewsGradientPlanes<T>& planes) {
         constexpr size_t kMostScratchRows = size_t(1) << 21;
         const size_t num_views = cameras_.size();
@@ -145,8 +110,8 @@ class HostViewsTape final : public ViewsTape {
     }
 
     // Adds the gradients of a view to `rows`, and sets those that it alone has.
-    void add_view(size_t view, GaussianRows<T> rows, const Sums& sums, const ViewsWanted& wanted,
-                  const ViewsGradientPlanes<T>& planes) const {
+    void add_view(size_t view, GaussianRows<T> rows, const NewViewsGradients<T>& sums,
+                  const ViewsWanted& wanted, const ViewsGradientPlanes<T>& planes) const {
         const size_t skipped = view * rows.size;
         if (wanted.opacities_for_each_view) rows.opacities += skipped;
         if (wanted.sh_for_each_view) rows.sh += skipped * rows.num_sh();

@@ -46,6 +46,9 @@ struct DrawLook {
     }
 };
 
+// Throws ValueError unless gaussians have coefficients of degree 0, as plain colours do.
+void check_plain_colors(const Rows& gaussians);
+
 // A drawn picture. `counts` are set on the host only; `tape` is null if not requested.
 struct Rasterized {
     py::object color, alpha, depth;
@@ -63,23 +66,13 @@ struct GradientPlane {
     py::object object;
     Span<const T> span;
 
-    GradientPlane(const py::object& given, const char* name, Device device,
-                  const std::vector<py::ssize_t>& shape)
-        : object(given.is_none() ? zeros(device, shape) : given) {
-        switch (shape.size()) {
-            case 2: span = span_on<const T>(device, object, name, {shape[0], shape[1]}); break;
-            case 3:
-                span = span_on<const T>(device, object, name, {shape[0], shape[1], shape[2]});
-                break;
-            default:
-                span = span_on<const T>(device, object, name,
-                                        {shape[0], shape[1], shape[2], shape[3]});
-        }
-    }
+    GradientPlane(const py::object& given, const char* name, Device device, const Shape& shape)
+        : object(given.is_none() ? zeros(device, shape) : given),
+          span(span_on<const T>(device, object, name, shape)) {}
 
   private:
     // NumPy arrays have fill(), torch tensors fill_().
-    static py::object zeros(Device device, const std::vector<py::ssize_t>& shape) {
+    static py::object zeros(Device device, const Shape& shape) {
         const py::object array = make_array(device, element_of<T>(), shape).object;
         array.attr(py::isinstance<py::array>(array) ? "fill" : "fill_")(0);
         return array;

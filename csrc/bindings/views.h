@@ -57,17 +57,42 @@ struct NewViews {
         const auto count = static_cast<py::ssize_t>(cameras.size());
         const py::ssize_t height = cameras.height();
         const py::ssize_t width = cameras.width();
-        const NewArray<T> new_color(device, {count, height, width, 3});
-        const NewArray<T> new_alpha(device, {count, height, width});
-        color = new_color.object;
-        alpha = new_alpha.object;
-        color_plane = new_color.span.data;
-        alpha_plane = new_alpha.span.data;
-        depth_plane = nullptr;
-        if (!with_depth) return;
-        const NewArray<T> new_depth(device, {count, height, width});
-        depth = new_depth.object;
-        depth_plane = new_depth.span.data;
+        color_plane = new_elements<T>(device, {count, height, width, 3}, color);
+        alpha_plane = new_elements<T>(device, {count, height, width}, alpha);
+        depth_plane = with_depth ? new_elements<T>(device, {count, height, width}, depth) : nullptr;
+    }
+};
+
+// The arrays of the gradients of views.
+template <class T>
+struct NewViewsGradients {
+    GaussianRows<T> rows;
+    CenterGradients<T> centers{};
+    T* background;
+    T* poses = nullptr;
+
+    // make(shape, object) makes an array like new_elements().
+    template <class Make>
+    NewViewsGradients(size_t size, int sh_degree, py::ssize_t num_views, const ViewsWanted& wanted,
+                      Gradients& made, const Make& make) {
+        const auto n = static_cast<py::ssize_t>(size);
+        const py::ssize_t bases = num_sh_bases(sh_degree);
+        const Shape opacities = wanted.opacities_for_each_view ? Shape{num_views, n} : Shape{n};
+        const Shape sh =
+            wanted.sh_for_each_view ? Shape{num_views, n, bases, 3} : Shape{n, bases, 3};
+        rows = {.means = make({n, 3}, made.means),
+                .quats = make({n, 4}, made.quats),
+                .scales = make({n, 3}, made.scales),
+                .opacities = make(opacities, made.opacities),
+                .sh = make(sh, made.sh),
+                .size = size,
+                .sh_degree = sh_degree};
+        background = make({num_views, 3}, made.background);
+        if (wanted.centers.sum) centers.sum = make({num_views, n, 2}, made.centers);
+        if (wanted.centers.size)
+            centers.size =
+                reinterpret_cast<CenterSize<T>*>(make({num_views, n, 2}, made.center_sizes));
+        if (wanted.poses) poses = make({num_views, 3, 4}, made.poses);
     }
 };
 
@@ -78,15 +103,11 @@ struct ViewsGradientPlanes {
     const T* depth;
     size_t num_pixels;
 
-    ViewsGradientPlanes(Device device, const std::vector<py::ssize_t>& shape,
-                        const py::object& d_color, const py::object& d_alpha,
-                        const py::object& d_depth)
+    ViewsGradientPlanes(Device device, const Shape& shape, const py::object& d_color,
+                        const py::object& d_alpha, const py::object& d_depth)
         : color(d_color, "d_color", device, {shape[0], shape[1], shape[2], 3}),
           alpha(d_alpha, "d_alpha", device, shape),
-          depth(d_depth.is_none()
-                    ? nullptr
-                    : span_on<const T>(device, d_depth, "d_depth", {shape[0], shape[1], shape[2]})
-                          .data),
+          depth(elements_or_null<const T>(device, d_depth, "d_depth", shape)),
           num_pixels(static_cast<size_t>(shape[1]) * static_cast<size_t>(shape[2])) {}
 
     PictureGradient<T> of_view(size_t view) const {

@@ -18,19 +18,13 @@ struct RaySensor {
     RayLimits limits;
 };
 
-struct CastCounts {
-    int64_t gaussians;    // of the selected clusters
-    float tolerance_px2;  // tolerance of the cut
-    double select_seconds;
-    RayCounts rays;
-};
-
 namespace cpu {
 
 // Selects the cut of a sensor, without a frustum, and casts all rays through it. The
-// camera has the pose of the sensor, and its density. `rule` has no budget.
-CastCounts cast_scene(const HostScene& scene, const RaySensor& sensor, const Camera& camera,
-                      SelectRule rule, const RayPlanes& planes);
+// camera has the pose of the sensor, and its density. `rule` has no budget. Returns the
+// number of selected gaussians.
+int64_t cast_scene(const HostScene& scene, const RaySensor& sensor, const Camera& camera,
+                   SelectRule rule, const RayPlanes& planes);
 
 }  // namespace cpu
 }  // namespace v3dg

@@ -13,7 +13,6 @@
 #include <utility>
 
 #include "base/buffer.h"
-#include "base/clock.h"
 #include "base/parallel_for.h"
 
 namespace v3dg {
@@ -155,9 +154,8 @@ RayGrid::RayGrid(Span<const double> azimuth, Span<const double> elevation,
                   .column_place = azimuth_.place.data(),
                   .row_place = elevation_.place.data()} {}
 
-RayCounts cpu::cast_rays(const std::vector<Draw<float>>& draws, const RayDirections& rays,
-                         const RayLimits& limits, const RayPlanes& planes) {
-    const double start = now();
+void cpu::cast_rays(const std::vector<Draw<float>>& draws, const RayDirections& rays,
+                    const RayLimits& limits, const RayPlanes& planes) {
     const std::vector<std::vector<Piece>> chunks = chunks_of(draws);
     std::vector<std::vector<RayRecord>> parts(chunks.size());
     parallel_for(chunks.size(), 1, [&](size_t c) {
@@ -167,9 +165,7 @@ RayCounts cpu::cast_rays(const std::vector<Draw<float>>& draws, const RayDirecti
     });
     size_t num_records = 0;
     const Buffer<RayRecord> records = join(parts, num_records);
-    const double projected = now();
     const RayLists lists(records.data(), num_records, rays);
-    const double binned = now();
     std::vector<RayScratch> scratch(most_threads());
     parallel_for(rays.num_tiles(), 1, [&](size_t tile) {
         const Span<uint64_t> entries = lists.of_tile(tile);
@@ -177,11 +173,6 @@ RayCounts cpu::cast_rays(const std::vector<Draw<float>>& draws, const RayDirecti
         V3DG_DISPATCH_ISA(cast_tile, records.data(), entries, rays, tile, limits,
                           scratch[omp_get_thread_num()], planes);
     });
-    return {.records = num_records,
-            .entries = lists.first.back(),
-            .project_seconds = projected - start,
-            .bin_seconds = binned - projected,
-            .blend_seconds = now() - binned};
 }
 
 }  // namespace v3dg

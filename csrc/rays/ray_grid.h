@@ -101,7 +101,8 @@ struct RayDirections {
     }
 
     V3DG_HD RayTiles tiles_of(const RayRange& range) const {
-        const int columns = tile_columns(), row = range.row0 / kRayTileRows;
+        const int columns = tile_columns();
+        const int row = range.row0 / kRayTileRows;
         const int column = range.column0 / kRayTileColumns;
         int last = range.column1 / kRayTileColumns;
         // Columns behind the last continue from the first tile, which may be reached

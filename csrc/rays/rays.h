@@ -99,16 +99,10 @@ V3DG_DECLARE_PER_ISA(void cast_tile(const RayRecord* records, Span<const uint64_
                                     const RayLimits& limits, RayScratch& scratch,
                                     const RayPlanes& planes))
 
-// The counts of a cast.
-struct RayCounts {
-    uint64_t records, entries;
-    double project_seconds, bin_seconds, blend_seconds;
-};
-
 namespace cpu {
 // Casts all rays of a grid through gaussians.
-RayCounts cast_rays(const std::vector<Draw<float>>& draws, const RayDirections& rays,
-                    const RayLimits& limits, const RayPlanes& planes);
+void cast_rays(const std::vector<Draw<float>>& draws, const RayDirections& rays,
+               const RayLimits& limits, const RayPlanes& planes);
 }  // namespace cpu
 
 }  // namespace v3dg

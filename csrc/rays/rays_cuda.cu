@@ -19,6 +19,7 @@
 #include <cub/device/device_radix_sort.cuh>
 
 #include "base/launch.cuh"
+#include "base/scan.cuh"
 #include "project/sources.cuh"
 
 namespace v3dg {
@@ -128,11 +129,7 @@ __device__ void store_record(const RayRecord& record, RayRecord* to) {
 
 // Returns the sum over the lanes before this one; `total` is the sum over all.
 __device__ uint32_t sum_before(uint32_t value, uint32_t& total) {
-    uint32_t sum = value;
-    for (unsigned step = 1; step < 32; step *= 2) {
-        const uint32_t other = __shfl_up_sync(kAllLanes, sum, step);
-        if (threadIdx.x % 32 >= step) sum += other;
-    }
+    const uint32_t sum = warp_prefix(value);
     total = __shfl_sync(kAllLanes, sum, 31);
     return sum - value;
 }
