@@ -45,15 +45,14 @@ struct FrameRequest {
     // Per bundle: the colours of clusters in host memory, as SH coefficients of degree
     // 0, [C][3]. An empty vector keeps the gaussians' colours.
     std::vector<const float*> cluster_colors = {};
-    // Channels beside colour, and the meshes of the only eye.
+    // Channels beside colour, and the meshes of the eyes, one after another.
     SensorRequest sensor = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
     // Returns whether every backend can draw the request. Other requests are drawn on
     // the host only.
     bool is_plain() const {
-        return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty() &&
-               !sensor.channels.clipped;
+        return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
     }
 };
 

@@ -20,7 +20,7 @@ from v3dg.render.frame import frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, sensor_of
+from v3dg.render.sensor import Channel, Meshes, sensor_of
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
 
@@ -36,7 +36,7 @@ class _Options(CutOptions, total=False):
     min_transmittance: float | None
     depth: bool
     channels: Sequence[Channel]
-    mesh: MeshLayer | None
+    mesh: Meshes | None
 
 
 class Renderer:
@@ -136,7 +136,7 @@ class Renderer:
         min_transmittance: float | None = None,
         depth: bool = False,
         channels: Sequence[Channel] = (),
-        mesh: MeshLayer | None = None,
+        mesh: Meshes | None = None,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
         """Draw a picture with what is resident; the arguments are those of
         `v3dg.render`."""
@@ -144,7 +144,7 @@ class Renderer:
         subject = self._subject
         is_asset = isinstance(subject, Gaussians)
         device = self._frame.device
-        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=device)
+        with_depth, sensor = sensor_of(channels, mesh, depth=depth, device=device)
         shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
         cut_request = CutRequest(tolerance, budget, min_level, fade)
         request = FrameRequest(camera, cut_request, shade, cut, sensor=sensor)
@@ -161,7 +161,7 @@ class Renderer:
         min_transmittance: float | None = None,
         depth: bool = False,
         channels: Sequence[Channel] = (),
-        mesh: MeshLayer | None = None,
+        mesh: Meshes | None = None,
         out: BatchPlanes | None = None,
     ) -> RenderedBatch:
         """Draw a picture for each of many cameras of one size by one call, with the
@@ -186,7 +186,7 @@ class Renderer:
             background: As in `v3dg.render`; so are `min_transmittance` and `depth`.
             channels: As in `v3dg.render`. Channels without planes in `out` are new
                 arrays.
-            mesh: As in `v3dg.render`, with planes (B, H, W).
+            mesh: As in `v3dg.render` for a list of cameras.
             out: Where to write colour and, if it has planes for them, alpha, depth and
                 channels; None for new arrays of colour, alpha and, if requested, depth.
                 They belong to the caller, and are valid once the result was read or, on
@@ -199,7 +199,7 @@ class Renderer:
         if not isinstance(cameras, CameraBatch):
             cameras = CameraBatch.of(cameras)
         device = self._frame.device
-        with_depth, sensor = sensor_of(channels, mesh, cameras, depth=depth, device=device)
+        with_depth, sensor = sensor_of(channels, mesh, depth=depth, device=device)
         check_planes(out, with_depth=with_depth)
         subject = self._subject
         shade = shade_of(background, min_transmittance, is_asset=False, depth=with_depth)

@@ -60,7 +60,8 @@ class SceneFrame(ResidentFrame):
         if selection is not None:
             if isinstance(camera, StereoCamera):
                 left, right = (
-                    self._draw_given(subject, request, selection, eye, stop) for eye in camera.eyes
+                    self._draw_given(subject, request.of_eye(number), selection, eye, stop)
+                    for number, eye in enumerate(camera.eyes)
                 )
                 return left, right
             return self._draw_given(subject, request, selection, camera, stop)
