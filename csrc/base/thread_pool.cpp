@@ -81,7 +81,7 @@ class ThreadPool {
     }
 
   private:
-    // If the system cannot start all threads, continue with those that were started.
+    // Starts threads until there are `count`, or until the system cannot start more.
     void start_threads(int count) V3DG_REQUIRES(busy_) {
         try {
             for (; num_threads_ < count; ++num_threads_) std::thread([this] { help(); }).detach();

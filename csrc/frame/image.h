@@ -118,7 +118,7 @@ constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
 // The destination of a picture on CUDA (see Picture<float>). It may be set after the
 // first stages of a frame are enqueued.
 struct PicturePlanes {
-    // Null pointers are allowed for all three, for all but alpha, or for depth.
+    // Either all three pointers, only `alpha`, or only `depth` may be null.
     float *color, *alpha, *depth;
     bool has_four_channels;  // alpha is the fourth channel of `color`
 };
