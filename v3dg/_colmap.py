@@ -267,7 +267,11 @@ def _binary_name(path: Path, file: IO[bytes]) -> str:
         size = content.find(b"\0")
         if size >= 0:
             break
-    check(path, size >= 0, f"a name of at most {_MAX_NAME_BYTES} bytes, got a longer one")
+    check(
+        path,
+        size >= 0,
+        f"a name of at most {_MAX_NAME_BYTES} bytes, got a longer one; is the file complete?",
+    )
     file.seek(start + size + 1)
     return _text(content[:size])
 

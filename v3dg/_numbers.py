@@ -41,7 +41,7 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
             array = np.array(array, dtype=np.float64, order="C")
     except OverflowError:
         raise ValueError(
-            f"{name}: expected {expected} that a double can hold, got a larger one"
+            f"{name}: expected {expected} below 1.8e308, the largest double, got a larger one"
         ) from None
     except (TypeError, ValueError, RuntimeError):
         kind = type(values).__name__

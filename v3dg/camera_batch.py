@@ -121,7 +121,7 @@ class CameraBatch:
         if not _is_on_device(environments):
             environments = torch.as_tensor(_environments(environments, count), device=device)
         tensor = _tensor(environments, "environments", _WHOLE, [(count,)])
-        check("environments", tensor.device == device, f"a tensor on {device}")
+        check("environments", tensor.device == device, f"a tensor on {device}, got {tensor.device}")
         self.environments = tensor
 
     @classmethod
@@ -143,7 +143,8 @@ class CameraBatch:
         for number, camera in enumerate(cameras):
             check_type(f"cameras[{number}]", camera, Camera, "a Camera")
             is_alike = form_of(camera) == form_of(cameras[0])
-            check(f"cameras[{number}]", is_alike, "the size and the near plane of the first one")
+            expected = "the size and the near plane of cameras[0], got others; make two batches"
+            check(f"cameras[{number}]", is_alike, expected)
         first = cameras[0]
         batch = cls(
             np.stack([camera.viewmat for camera in cameras]),

@@ -123,7 +123,7 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
         # pictures.
         warnings.simplefilter("ignore")
         is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
-        check(name, is_known, "a PNG or a JPEG, got another file")
+        check(name, is_known, "a PNG or a JPEG, got another file; convert it first")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
             # Only these formats are allowed, because Pillow starts external programs
             # for some others.

@@ -78,11 +78,8 @@ class Selection:
         weights = self.weights
         expected = f"{len(self)} numbers from 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
-        check(
-            "given_weights",
-            ((weights >= 0) & (weights <= 1)).all(),
-            f"{expected}, got other values",
-        )
+        is_wrong = ~((weights >= 0) & (weights <= 1))
+        check("given_weights", not is_wrong.any(), f"{expected}, got {weights[is_wrong][:1]}")
         for values in (self.instance_ids, self.cluster_ids, weights):
             values.flags.writeable = False
 

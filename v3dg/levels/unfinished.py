@@ -197,7 +197,7 @@ class Unfinished:
         while _files.read_at(descriptor, head, self._end):
             part, number, digest = _RECORD.unpack(head.tobytes())
             if not (part < len(self._parts) and number in self._parts[part]):
-                raise ValueError("a level is damaged")
+                raise ValueError("a finished level is damaged")
             plan, run = self._parts[part][number]
             tables = LevelTables(
                 box=np.empty((plan.num_clusters, 2, 3), np.float32),
@@ -213,7 +213,7 @@ class Unfinished:
                     return
                 end += array.nbytes
             if page_hash(arrays) != digest:
-                raise ValueError("a level is damaged")
+                raise ValueError("a finished level is damaged")
             level = FinishedLevel(tables, hashes)
             level.read(self.pages, run)  # checks the hashes of the pages
             self.levels[part, number] = level
