@@ -1,5 +1,5 @@
 // Parses JSON into a tree of values, from the events of the library nlohmann/json. The
-// tree distinguishes whole numbers from others. Two errors are detected here, because
+// tree distinguishes integers from other numbers. Two errors are detected here, because
 // the library accepts them: keys that occur twice, and text after a zero byte.
 
 #include "c_interface/json.h"
@@ -69,8 +69,9 @@ class Builder final : public nlohmann::json_sax<nlohmann::json> {
         open_.pop_back();
         return true;
     }
-    // Returns where the next value belongs. A container that is open is the last value
-    // of the one around it, which does not grow meanwhile, so pointers stay valid.
+    // Returns the location of the next value. An open container is the last element of
+    // the container around it. That container does not grow while the inner one is
+    // open, so pointers stay valid.
     Json& place() {
         if (open_.empty()) return root_;
         if (auto* array = std::get_if<Json::Array>(&open_.back()->value))

@@ -1,4 +1,4 @@
-// The checks of values in a JSON file, with the messages of the Python reader.
+// Checks of values in a JSON file, with the error texts of the Python reader.
 
 #include "c_interface/json_node.h"
 

@@ -1,5 +1,5 @@
-// Parses the header of a .ply file. Callers compare the sizes in it with the size of
-// the file.
+// Parses the header of a .ply file. Callers must compare the sizes in it with the size
+// of the file.
 
 #include "io/ply_header.h"
 
@@ -10,10 +10,10 @@ namespace v3dg {
 
 namespace {
 
-// Real headers have a few kilobytes.
+// Maximum size of a header. Real headers have a few kilobytes.
 constexpr size_t kMaxHeaderBytes = size_t(1) << 20;
-// The largest number of elements. Real files have one or two. Elements before the
-// vertices must be skipped one after another.
+// Maximum number of elements. Real files have one or two. There is a limit because
+// elements before the vertices must be skipped one after another.
 constexpr size_t kMaxElements = 64;
 
 constexpr const char* kSpace = " \t\r\v\f";
@@ -97,7 +97,7 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     return property;
 }
 
-// Parses the lines of one header, one after another.
+// Parses the lines of a header, one after another.
 struct HeaderParser {
     PlyHeader header;
     bool has_format = false;

@@ -1,4 +1,4 @@
-// Reads .ply text. LineReader separates lines, NumberReader reads the numbers of a
+// Reads .ply text. LineReader separates lines, and NumberReader reads the numbers of a
 // line.
 
 #include "io/ply_text.h"
@@ -28,8 +28,8 @@ bool is_space(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\v' |
 // Reads the lines of a text file, except blank lines.
 class LineReader {
   public:
-    // The buffer has room for one byte more than the rest of the file, so that reading
-    // detects the end of the file.
+    // The buffer has room for one byte more than the rest of the file. This byte makes
+    // the end of the file detectable.
     LineReader(const File& file, size_t offset, size_t file_bytes)
         : file_(file),
           offset_(offset),
@@ -37,8 +37,8 @@ class LineReader {
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
-    // Returns some of the next lines: at least one and at most `max_lines`, or none at
-    // the end of the file. They are valid until the next call.
+    // Returns some of the next lines: at most `max_lines`, and at least one unless the
+    // file has ended. They are valid until the next call.
     const std::vector<Line>& next(uint64_t max_lines) {
         lines_.clear();
         bool at_end = false;
@@ -131,7 +131,7 @@ class NumberReader {
 };
 
 // Rounds a number to its type. A float is written as the shortest text that identifies
-// it among floats; read as a double, this text is a slightly different number.
+// it among floats. Read as a double, this text gives a slightly different number.
 double rounded_to(PlyType type, double value) {
     return type == PlyType::float32 ? static_cast<double>(static_cast<float>(value)) : value;
 }
