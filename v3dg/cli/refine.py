@@ -48,13 +48,13 @@ class Refine(CameraFile, _common.OnDevice):
     of more than 4 million gaussians is refined in units, each with this number."""
     cameras: Annotated[Path | None, _common.option("PATH")] = None
     """File or folder of cameras, as for `v3dg render`, such as those of the asset's
-    photographs. By default, cameras are found, see --seen-from."""
+    photographs. By default, cameras are chosen as --seen-from says."""
     seen_from: Annotated[SeenFrom, _common.option("{auto,outside,inside,both}")] = "auto"
-    """From where pictures are taken without cameras; by default, the free space that
-    the asset surrounds decides."""
+    """Where pictures are taken from if no cameras are given. By default, this depends
+    on the free space that the asset surrounds."""
     drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
-    """Share of a level's visibility that may be lost by dropping its least visible
-    gaussians; 0 keeps all."""
+    """Fraction of a level's visibility that may be lost by dropping its least visible
+    gaussians. 0 keeps all gaussians."""
     seed: int = 0
     """Seed of random numbers. The same seed gives the same file, byte for byte, on the
     same kind of device and for any number of threads."""
@@ -94,7 +94,7 @@ def run(options: Refine) -> None:
 
 
 def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
-    """Write the refined bundle, and return it, opened from its file."""
+    """Write the refined bundle to a file, open the file, and return the bundle."""
     refined = refine_bundle(
         bundle,
         cameras=list(options.read().values()),
@@ -112,7 +112,8 @@ def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
 
 
 def _summary(result: JsonObject, refined: Bundle) -> str:
-    """Return the line about what was refined, and how long it took."""
+    """Return a line of text with the numbers of pictures and units, and the time that
+    the refinement took."""
     line = f"{result['output']}: {result['steps']:,} steps"
     if result["units"] > 1:
         line += f" for each of {result['units']} units and the levels above them"
@@ -158,8 +159,8 @@ def _psnr(mean_square: float) -> float:
 
 
 def _warning(rows: list[JsonObject]) -> list[str]:
-    """Return lines about the widths of pictures at which the result is worse; empty if
-    there are none."""
+    """Return lines about the picture widths at which the result is worse. Without such
+    widths, there are no lines."""
     worse = [str(row["width"]) for row in rows if row["after"] < row["before"] - _NOTICED_DB]
     if not worse:
         return []
