@@ -18,11 +18,10 @@ from v3dg.cameras import Camera
 from v3dg.cli import _common
 from v3dg.cli._views import CameraFile
 from v3dg.framing import frame_subject
-from v3dg.levels.unfinished import discard_units, units_folder
 from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.metrics import MIN_TRANSMITTANCE, draw_truth
 from v3dg.pictures import to_8bit
-from v3dg.refine import refine_bundle
+from v3dg.refine import refine_file
 from v3dg.render import render
 from v3dg.upright import direction_of, up_of
 
@@ -69,7 +68,7 @@ def run(options: Refine) -> None:
     make_folder(options.output)
     start = time.perf_counter()
     bundle = Bundle.open(options.bundle)
-    refined = _refined_file(bundle, options)
+    refined = _refined(bundle, options)
     seconds = time.perf_counter() - start
     num_units = refined.config.get("refined", {}).get("units", 1)
     rows: list[JsonObject] = []
@@ -93,10 +92,10 @@ def run(options: Refine) -> None:
     _common.print_result(result, lines, as_json=options.json)
 
 
-def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
-    """Write the refined bundle, and return it, opened from its file."""
-    refined = refine_bundle(
+def _refined(bundle: Bundle, options: Refine) -> Bundle:
+    return refine_file(
         bundle,
+        options.output,
         cameras=list(options.read().values()),
         seen_from=options.seen_from,
         steps=options.steps,
@@ -104,11 +103,7 @@ def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
         seed=options.seed,
         device=options.device,
         progress=not options.quiet,
-        folder=units_folder(options.output),
     )
-    refined.write(options.output)
-    discard_units(options.output)
-    return Bundle.open(options.output)
 
 
 def _summary(result: JsonObject, refined: Bundle) -> str:
