@@ -13,6 +13,7 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, check_pinhole
 from v3dg.levels.refined import DROP, RefineRequest
 from v3dg.levels.refined_units import refined_bundle
+from v3dg.levels.unfinished import discard_units, locked_units, units_folder
 from v3dg.levels.viewpoints import SeenFrom
 from v3dg.levels.whole import devices_for
 from v3dg.opening import File
@@ -83,10 +84,56 @@ def refine_bundle(
             Camera.
         ValueError: ``steps``, ``drop`` or ``seed`` is out of range, or ``seen_from`` is
             "inside" or "both" and the asset surrounds no place.
-        RuntimeError: The device is "cuda" and cannot be used.
+        RuntimeError: The device is "cuda" and cannot be used, or another refinement is
+            using the folder.
         KeyboardInterrupt: Ctrl-C was pressed; threads have stopped, and finished units
             are in the folder.
     """
+    bundle, request = _checked(bundle, cameras, seen_from, steps, drop, seed)
+    devices = devices_for(device)
+    if folder is None:
+        return refined_bundle(bundle, request, devices, progress)
+    with locked_units(Path(folder)) as units:
+        return refined_bundle(bundle, request, devices, progress, units)
+
+
+def refine_file(
+    bundle: Bundle | File,
+    output: Path,
+    *,
+    cameras: Iterable[Camera] | Mapping[str, Camera] = (),
+    seen_from: SeenFrom = "auto",
+    steps: int = 30_000,
+    drop: float = DROP,
+    seed: int = 0,
+    device: str | Device = "auto",
+    progress: Progress = True,
+) -> Bundle:
+    """Write what `refine_bundle` returns to a file, and return it, opened from there.
+
+    Finished units of a large bundle are beside the file until it is written, so another
+    call with the same arguments continues after the last one.
+
+    Raises:
+        RuntimeError: Another refinement is writing this file, or the device is "cuda"
+            and cannot be used.
+        Exception: See `refine_bundle`.
+    """
+    bundle, request = _checked(bundle, cameras, seen_from, steps, drop, seed)
+    with locked_units(units_folder(output)) as units:
+        refined_bundle(bundle, request, devices_for(device), progress, units).write(output)
+        discard_units(output)
+    return Bundle.open(output)
+
+
+def _checked(
+    bundle: Bundle | File,
+    cameras: Iterable[Camera] | Mapping[str, Camera],
+    seen_from: SeenFrom,
+    steps: int,
+    drop: float,
+    seed: int,
+) -> tuple[Bundle, RefineRequest]:
     if isinstance(bundle, str | os.PathLike):
         bundle = Bundle.open(bundle)
     check_type("bundle", bundle, Bundle, "a Bundle")
@@ -102,8 +149,4 @@ def refine_bundle(
     steps = whole(steps, "steps", "at least 1 step", 1, 1_000_000)
     drop = real(drop, "drop", "a share from 0 to 0.5", 0, 0.5)
     seed = whole(seed, "seed", "a whole number from 0 to 2^58 - 1", 0, (1 << 58) - 1)
-    request = RefineRequest(steps, drop, seed, seen_from, tuple(cameras))
-    units_folder = None
-    if folder is not None:
-        units_folder = Path(folder)
-    return refined_bundle(bundle, request, devices_for(device), progress, units_folder)
+    return bundle, RefineRequest(steps, drop, seed, seen_from, tuple(cameras))

@@ -18,11 +18,10 @@ from v3dg.cameras import Camera
 from v3dg.cli import _common
 from v3dg.cli._views import CameraFile
 from v3dg.framing import frame_subject
-from v3dg.levels.unfinished import discard_units, units_folder
 from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.metrics import MIN_TRANSMITTANCE, draw_truth
 from v3dg.pictures import to_8bit
-from v3dg.refine import refine_bundle
+from v3dg.refine import refine_file
 from v3dg.render import render
 from v3dg.upright import direction_of, up_of
 
@@ -95,8 +94,9 @@ def run(options: Refine) -> None:
 
 def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
     """Write the refined bundle to a file, open the file, and return the bundle."""
-    refined = refine_bundle(
+    return refine_file(
         bundle,
+        options.output,
         cameras=list(options.read().values()),
         seen_from=options.seen_from,
         steps=options.steps,
@@ -104,11 +104,7 @@ def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
         seed=options.seed,
         device=options.device,
         progress=not options.quiet,
-        folder=units_folder(options.output),
     )
-    refined.write(options.output)
-    discard_units(options.output)
-    return Bundle.open(options.output)
 
 
 def _summary(result: JsonObject, refined: Bundle) -> str:
