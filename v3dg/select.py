@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value", bound=np.generic)
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
-# The default tolerance: px² on screen for each gaussian of a coarser cluster.
-# docs/levels.md lists the errors.
+# The default tolerance: px² on screen per gaussian of a coarser cluster. docs/levels.md
+# lists the errors.
 DEFAULT_TOLERANCE = 3.0
 
 # The recommended fade for sequences of pictures. docs/fades.md describes its cost and
@@ -43,19 +43,19 @@ class Selection:
     """The clusters that one view needs, in ascending order of instance, then cluster.
 
     Attributes:
-        scene: The scene of the selection. Its instances may be moved, and instances may
-            be added. If instances are removed, the cut becomes invalid, and drawing it
-            raises ValueError.
+        scene: The scene of the selection. Instances may be moved and added afterwards.
+            If instances are removed, the cut becomes invalid, and drawing it raises
+            ValueError.
         instance_ids: (S,) int32 indices of instances, read-only.
         cluster_ids: (S,) int32 indices of clusters in the instance's bundle, read-only.
         num_gaussians: Number of gaussians in all selected clusters.
-        tolerance: The tolerance in px² per gaussian; with a budget, the tolerance that
-            meets it.
+        tolerance: The tolerance in px² per gaussian. With a budget, it is the tolerance
+            that meets the budget.
         seconds: Wall-clock time of the selection.
         revision: Revision of the scene at the time of the selection; None means the
             current revision.
-        given_weights: (S,) weights with which the clusters are drawn, read-only; None
-            without a fade, which means that all weights are 1.
+        given_weights: (S,) weights with which the clusters are drawn, read-only.
+            Without a fade, it is None, which means that all weights are 1.
     """
 
     scene: Scene
