@@ -277,13 +277,13 @@ def _binary_name(path: Path, file: IO[bytes]) -> str:
 
 
 def _text(content: bytes) -> str:
-    """Decode a name in UTF-8; bytes that are not UTF-8 become escapes."""
+    """Decode a name in UTF-8. Bytes that are not UTF-8 become escapes."""
     return content.decode("utf-8", errors="backslashreplace")
 
 
 def _number(word: bytes) -> float:
-    """Return the number in a word of text; infinite numbers become NaN. Raise
-    ValueError if the word is not a number."""
+    """Convert a word of text to a number. Infinite numbers become NaN. Raise ValueError
+    if the word is not a number."""
     if _WINDOWS_NOT_FINITE.fullmatch(word):
         return math.nan
     return float(word)
@@ -336,7 +336,7 @@ def _text_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
 
 def _check_points(path: Path, numbered: tuple[int, bytes]) -> None:
     """Raise ValueError unless a line is a list of the points of an image. The line may
-    be empty, but if it were missing, the next image would be read in its place."""
+    be empty. If it were missing, the next image would be read in its place."""
     number, line = numbered
     words = line.split()
     try:
