@@ -356,12 +356,17 @@ def test_a_batch_marks_the_clipped_pixels_of_each_camera_alone(clipped_scenes):
     plain = renderer.render_batch(cameras, channels=("depth",))
     assert torch.equal(batch.color, plain.color)
     assert torch.equal(batch.depth, plain.depth)
+    there = tensors_of(cameras, near=1.0)
+    planes = BatchPlanes(torch.zeros(7, HEIGHT, WIDTH, 3, device="cuda"))
+    renderer.render_batch(there, channels=("clipped",), out=planes).wait()
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        captured = renderer.render_batch(cameras, channels=("clipped", "depth"))
-    graph.replay()
-    torch.cuda.synchronize()
-    assert torch.equal(captured.clipped, batch.clipped)
+        captured = renderer.render_batch(there, channels=("clipped",), out=planes)
+    for clipped in (batch.clipped, batch.clipped.flip(0)):
+        graph.replay()
+        torch.cuda.synchronize()
+        assert torch.equal(captured.clipped, clipped)
+        there.viewmats.copy_(there.viewmats.flip(0).clone())
 
 
 def test_cameras_of_an_environment_are_clipped_by_its_instances():
