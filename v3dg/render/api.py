@@ -137,13 +137,17 @@ def render(
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what
             the next picture of the same scene or bundle needs; a `Renderer` controls
-            how long. "auto" means "cuda" if it works.
+            how long. "auto" means "cuda" if it works, otherwise "cpu". "webgpu" draws
+            NumPy arrays on a GPU of any maker, with pinholes, colour and alpha only
+            (docs/webgpu.md).
         memory: As in `Renderer`; each picture waits for all pages that it needs.
 
     Raises:
         ValueError: An argument is invalid, or the coarsest cut has more gaussians than
             the budget; on CUDA the latter is raised when the picture is used.
-        RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
+        RuntimeError: `device` is "cuda" or "webgpu", and something that it needs is
+            missing.
+        ImportError: `device` is "webgpu", and the package wgpu is missing.
     """
     opened_subject, camera = _with_camera(subject, camera)
     cut_request = CutRequest(tolerance, budget, min_level, fade)
@@ -151,7 +155,7 @@ def render(
         with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=_device.CPU)
         check_rays(color_by, cut, sensor, min_transmittance, memory)
         return draw_rays(opened_subject, camera, cut_request, background, device, depth=with_depth)
-    chosen_device = _device.resolve(device)
+    chosen_device = _device.resolve_for_drawing(device)
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
     with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=chosen_device)
