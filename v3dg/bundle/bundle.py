@@ -356,7 +356,9 @@ class Bundle:
         Raises:
             ValueError: The bundle is not in a file.
         """
-        check("bundle", self._file is not None, "a bundle in a file, got one in memory")
+        check(
+            "bundle", self._file is not None, "a bundle in a file, got one in memory; save it first"
+        )
         assert self._file is not None
         return self._file.tables["pages.hash"]
 

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 
 class SceneFrame(ResidentFrame):
-    """Draws a scene or a bundle on one device, where all its gaussians are resident.
+    """Draws a scene or a bundle on one device, with all gaussians resident.
 
-    It does not keep the subject alive.
+    The frame does not keep the subject alive.
 
     Attributes:
         memory: None, because this frame has no pool.
@@ -94,7 +94,7 @@ class SceneFrame(ResidentFrame):
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
-        """Return at once, because everything is resident."""
+        """Return immediately, because everything is resident."""
 
     def _draw_given(
         self,
@@ -139,8 +139,8 @@ class SceneFrame(ResidentFrame):
 def check_cut(
     cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest
 ) -> None:
-    """Raise ValueError for a cut that was not selected from the current scene, and for
-    other arguments that contradict the cut."""
+    """Raise ValueError if a cut was not selected from the current scene, or if other
+    arguments contradict the cut."""
     check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in request._asdict().items():
         check(name, not value, f"no value together with a cut, got {value}; leave it out")

@@ -1,4 +1,4 @@
-"""Channels of pictures beside colour, and layers of meshes that are combined with
+"""Channels of pictures other than colour, and layers of meshes that are combined with
 gaussians. docs/sensors.md defines them."""
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
 Channel: TypeAlias = Literal[
     "depth", "median_depth", "normal", "instance", "label", "weight", "clipped"
 ]
-"""A channel that is drawn beside colour and alpha."""
+"""A channel that is drawn in addition to colour and alpha."""
 
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 MESH = -2
-"""The value of the channel `instance` if a mesh without ids has the largest weight."""
+"""The value of the channel `instance` where a mesh without ids has the largest
+weight."""
 
 
 class _Planes(NamedTuple):
@@ -45,29 +46,30 @@ class _Planes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeshLayer:
-    """A picture of meshes with its z-buffer, from any renderer, for the same camera.
+    """A picture of meshes with its z-buffer, for the same camera. Any renderer may have
+    drawn it.
 
     Gaussians behind the meshes are hidden, and those in front are blended over them.
-    The planes are (H, W) for one camera, or (B, H, W) for a batch. They are arrays, or
-    torch tensors. If the depth is a tensor on a CUDA device, all planes must be tensors
-    there. They are read when the picture is drawn on that device, without copies to the
-    host and without checks of their values: where the depth is not positive and finite,
-    or the coverage is NaN, there is no mesh. Other planes are checked on the host.
+    The planes are (H, W) for one camera, or (B, H, W) for a batch, as arrays or torch
+    tensors. If the depth is a tensor on a CUDA device, all planes must be tensors on
+    that device. They are read when the picture is drawn, without copies to the host.
+    Their values are not checked; where the depth is not positive and finite, or the
+    coverage is NaN, there is no mesh. All other planes are checked on the host.
 
     Attributes:
         color: (..., 3) colour of the meshes, 1 for white, not multiplied by coverage.
             Divide 8-bit colours by 255.
         depth: (...) depth of the meshes along the camera's axis, in world units. A
-            gaussian is in front if the depth of its centre is smaller.
+            gaussian is in front if its mean has a smaller depth.
         coverage: (...) fraction of the pixel that meshes cover, 0 to 1. None means 1
-            where the depth is positive and finite, else 0.
-        normal: (..., 3) normals in the axes of the camera (x right, y down, z forward),
-            of any length. None means that meshes contribute no normals.
+            where the depth is positive and finite, and 0 elsewhere.
+        normal: (..., 3) normals of any length in the axes of the camera (x right, y
+            down, z forward). None means that meshes contribute no normals.
         instance: (...) whole numbers for the channel `instance`; None means `MESH`.
         label: (...) whole numbers for the channel `label`; None means -1.
-        light: The light of `color`, in which meshes and gaussians are mixed: "display"
-            (sRGB, in which gaussians are trained) or "linear". The resulting picture is
-            in display light in both cases.
+        light: The light in which `color` is stored and is mixed with gaussians:
+            "display" (sRGB, in which gaussians are trained) or "linear". The resulting
+            picture is in display light in both cases.
     """
 
     color: Array
@@ -122,7 +124,8 @@ class MeshLayer:
         )
 
     def _planes_there(self, device: Device) -> _Planes:
-        """Return the planes, which are tensors on a device, without waiting for it."""
+        """Return planes that are tensors on a device, without waiting for the
+        device."""
         one_of(self.light, "mesh.light", ("display", "linear"))
         shape = tuple(self.depth.shape)
         check("mesh.depth", len(shape) in (2, 3), f"shape (H, W) or (B, H, W), got {shape}")
@@ -162,8 +165,9 @@ def _tensor(
     device: Device,
     dtype: Literal["float32", "int32"],
 ) -> torch.Tensor | None:
-    """Return a plane on a device with a type and in one piece; None stays None. Raise
-    ValueError for a plane of another shape, on another device or of another kind."""
+    """Return a plane on a device as a contiguous tensor of a dtype; None stays None.
+    Raise ValueError for a plane of another shape, on another device or of another
+    kind."""
     if plane is None:
         return None
     import torch
@@ -195,7 +199,10 @@ def _on_device(plane: Array | None, device: Device) -> Array | None:
 
 
 def _array(values: Array, name: str) -> HostArray:
-    """Return an array or a tensor as a NumPy array; raise ValueError for others."""
+    """Return an array or a tensor as a NumPy array.
+
+    Raise ValueError for other types.
+    """
     array: HostArray
     try:
         if hasattr(values, "detach"):
@@ -211,7 +218,7 @@ def _array(values: Array, name: str) -> HostArray:
 def _numbers(
     values: Array, name: str, shape: tuple[int, ...] | None = None
 ) -> npt.NDArray[np.float32]:
-    """Return a plane as float32; raise ValueError for NaN or another shape."""
+    """Return a plane as float32. Raise ValueError for NaN or another shape."""
     array = _array(values, name)
     check(f"mesh.{name}", array.dtype.kind in "biuf", f"an array of numbers, got {array.dtype}")
     fits = shape is None or array.shape == shape
@@ -223,7 +230,7 @@ def _numbers(
 
 
 def _ids(values: Array | None, name: str, shape: tuple[int, ...]) -> npt.NDArray[np.int32] | None:
-    """Return a plane of ids as int32; raise ValueError for other kinds and shapes."""
+    """Return a plane of ids as int32. Raise ValueError for other dtypes and shapes."""
     if values is None:
         return None
     array = _array(values, name)
@@ -239,7 +246,7 @@ def _ids(values: Array | None, name: str, shape: tuple[int, ...]) -> npt.NDArray
 def _refuse_any(
     array: npt.NDArray[np.generic], is_wrong: npt.NDArray[np.bool_], name: str, expected: str
 ) -> None:
-    """Raise a ValueError that names the first wrong value and its index."""
+    """Raise a ValueError that has the first wrong value and its index."""
     if not is_wrong.any():
         return
     place = tuple(int(number[0]) for number in np.nonzero(is_wrong))
@@ -255,8 +262,9 @@ def sensor_of(
     depth: bool,
     device: Device = CPU,
 ) -> tuple[bool, _core.Sensor | None]:
-    """Return whether depth is drawn, and the request for other channels and meshes, or
-    None without any. The planes of the mesh are brought to a device.
+    """Return whether depth is drawn, and the request for other channels and meshes. The
+    request is None if there are neither. The planes of the mesh are brought to a
+    device.
 
     Raises:
         TypeError: `channels` is not a sequence of names, or `mesh` is not a
