@@ -67,8 +67,8 @@ class Drawn(NamedTuple):
     num_gaussians: int
 
 
-class _Step(NamedTuple):
-    """A dispatch of one pipeline."""
+class Step(NamedTuple):
+    """A dispatch of one pipeline, whose label is the entry point of its shader."""
 
     pipeline: wgpu.GPUComputePipeline
     group: wgpu.GPUBindGroup
@@ -126,6 +126,13 @@ class _Buffers:
             self._buffers.pop(name).destroy()
         self.num_replaced += 1
         self._buffers[name] = self._gpu.buffer((num_bytes + 3) // 4 * 4, usage)
+
+
+def dispatch(computing: wgpu.GPUComputePassEncoder, step: Step) -> None:
+    """Encode one step."""
+    computing.set_pipeline(step.pipeline)
+    computing.set_bind_group(0, step.group)
+    computing.dispatch_workgroups(*step.workgroups)
 
 
 class Drawer:
@@ -214,7 +221,7 @@ class Drawer:
             self._layouts[types] = _layout_of(device, types)
         layout = device.create_pipeline_layout(bind_group_layouts=[self._layouts[types]])
         return device.create_compute_pipeline(
-            layout=layout, compute={"module": module, "entry_point": entry}
+            label=entry, layout=layout, compute={"module": module, "entry_point": entry}
         )
 
     def _group(self, types: tuple[str | None, ...], names: Sequence[str]) -> wgpu.GPUBindGroup:
@@ -276,15 +283,17 @@ class Drawer:
         self._bind(camera)
         encoder = self.gpu.device.create_command_encoder()
         encoder.clear_buffer(buffers["ranges"], 0, buffers["ranges"].size)
-        computing = encoder.begin_compute_pass()
-        for step in self._steps(num_gaussians, camera):
-            computing.set_pipeline(step.pipeline)
-            computing.set_bind_group(0, step.group)
-            computing.dispatch_workgroups(*step.workgroups)
-        computing.end()
+        self.encode(encoder, self._steps(num_gaussians, camera))
         self.gpu.device.queue.submit([encoder.finish()])
         assert self._picture is not None
         return self._picture
+
+    def encode(self, encoder: wgpu.GPUCommandEncoder, steps: Iterator[Step]) -> None:
+        """Encode the steps of a picture, each of which waits for the one before."""
+        computing = encoder.begin_compute_pass()
+        for step in steps:
+            dispatch(computing, step)
+        computing.end()
 
     def _set_passes(self, name: str, num_tiles: int, num_passes: int, bits: int) -> None:
         """Write the uniforms of the passes of one sort."""
@@ -328,29 +337,29 @@ class Drawer:
             groups.append(self._group(_SORTING, names))
         return groups
 
-    def _steps(self, num_gaussians: int, camera: Camera) -> Iterator[_Step]:
+    def _steps(self, num_gaussians: int, camera: Camera) -> Iterator[Step]:
         """Yield the steps of a picture."""
         groups = self._groups
         assert groups is not None
         num_blocks = _divided(num_gaussians, GAUSSIANS_OF_WORKGROUP)
-        yield _Step(self._project, groups.projecting, (num_blocks,))
+        yield Step(self._project, groups.projecting, (num_blocks,))
         num_tiles = _divided(num_gaussians, _KEYS_OF_TILE)
         for group in groups.depth_passes:
             yield from self._sorting_steps(group, num_tiles)
-        yield _Step(self._count_pairs, groups.listing, (num_blocks,))
-        yield _Step(self._sum_blocks, groups.listing, (1,))
-        yield _Step(self._write_pairs, groups.listing, (num_blocks,))
+        yield Step(self._count_pairs, groups.listing, (num_blocks,))
+        yield Step(self._sum_blocks, groups.listing, (1,))
+        yield Step(self._write_pairs, groups.listing, (num_blocks,))
         num_pair_tiles = _divided(self._pair_capacity, _KEYS_OF_TILE)
         for group in groups.tile_passes:
             yield from self._sorting_steps(group, num_pair_tiles)
         num_workgroups = _divided(self._pair_capacity, _PAIRS_OF_WORKGROUP)
-        yield _Step(self._find_ranges, groups.finding, (num_workgroups,))
-        yield _Step(self._blend, groups.blending, _tiles_of(camera))
+        yield Step(self._find_ranges, groups.finding, (num_workgroups,))
+        yield Step(self._blend, groups.blending, _tiles_of(camera))
 
-    def _sorting_steps(self, group: wgpu.GPUBindGroup, num_tiles: int) -> Iterator[_Step]:
-        yield _Step(self._count_digits, group, (num_tiles,))
-        yield _Step(self._sum_counts, group, (_DIGITS,))
-        yield _Step(self._move_keys, group, (num_tiles,))
+    def _sorting_steps(self, group: wgpu.GPUBindGroup, num_tiles: int) -> Iterator[Step]:
+        yield Step(self._count_digits, group, (num_tiles,))
+        yield Step(self._sum_counts, group, (_DIGITS,))
+        yield Step(self._move_keys, group, (num_tiles,))
 
     def _new_picture(self, size: tuple[int, int]) -> wgpu.GPUTexture:
         from wgpu import TextureUsage

@@ -11,6 +11,8 @@ import numpy as np
 from v3dg import _extras, export
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import wgpu
     from numpy.typing import NDArray
 
@@ -23,17 +25,22 @@ _LEAST_BYTES = 16
 class Gpu:
     """A device of WebGPU.
 
+    Args:
+        features: Optional features of the adapter that are enabled.
+
     Attributes:
         device: The device of the package wgpu.
         name: The name of the adapter.
         most_bytes: Size of the largest buffer that a shader can use.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, features: Sequence[str] = ()) -> None:
         _extras.load("wgpu")
         adapter = _adapter()
         limits = {name: adapter.limits[name] for name in _LIMITS}
-        self.device: wgpu.GPUDevice = adapter.request_device_sync(required_limits=limits)
+        self.device: wgpu.GPUDevice = adapter.request_device_sync(
+            required_features=list(features), required_limits=limits
+        )
         self.name = str(adapter.info["device"])
         # Sizes of buffers are multiples of 4.
         self.most_bytes = int(min(limits.values())) // 4 * 4
