@@ -406,6 +406,8 @@ void bind_frame(py::module_& m) {
                  [](const std::array<double, 3>& background, float min_transmittance,
                     bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
              py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a)
+        .def_readonly("background", &Shade::background)
+        .def_readonly("min_transmittance", &Shade::min_transmittance)
         .def_readonly("with_depth", &Shade::with_depth);
     py::class_<NewPicture>(m, "Picture", "A drawn picture: arrays of colour, alpha and depth.")
         .def_readonly("color", &NewPicture::color)

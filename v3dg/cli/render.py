@@ -17,7 +17,8 @@ from v3dg.cli._common import (
     Color,
     Column,
     Cut,
-    OnPool,
+    OnAnyDevice,
+    Pooled,
     check_output,
     check_range,
     check_usage,
@@ -48,7 +49,7 @@ _MOST_SECONDS = 600.0  # the same limit as for camera paths of the viewer
 
 
 @dataclass
-class Render(Cut, OnPool):
+class Render(Cut, Pooled, OnAnyDevice):
     """Draw a scene, a bundle or an asset. The cameras are those of its file, those of
     --cameras, one at a given position, or else first views that show the whole
     subject."""
@@ -118,7 +119,7 @@ def run(options: Render) -> None:
     options.view.check(options.subject)
     background = color_of(options.background)
     output = _checked_output(options, background)
-    device = _device.resolve(options.device)
+    device = _device.resolve_for_drawing(options.device)
     subject, own_cameras = open_subject(options.subject, show=not options.quiet)
     notes: list[str] = []
     needs_up = options.view.needs_up(own_cameras)
@@ -155,8 +156,9 @@ def run(options: Render) -> None:
 
 def _casts_rays(options: Render, renderer: Renderer) -> bool:
     """Return whether panoramas are drawn with rays, which have neither budgets nor
-    false colours, and need all gaussians in memory."""
+    false colours, need all gaussians in memory, and are not drawn by WebGPU."""
     is_plain = options.budget is None and options.color_by == "appearance"
+    is_plain = is_plain and options.device != "webgpu"
     return options.is_panorama and is_plain and renderer.memory is None
 
 

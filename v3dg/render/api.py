@@ -141,13 +141,17 @@ def render(
         device: "cpu" draws NumPy arrays. "cuda", or a specific device such as "cuda:1",
             draws torch tensors on that device, on torch's current stream. What the next
             picture of the same scene or bundle needs stays on the device; use a
-            `Renderer` to control how long. "auto" means "cuda" if it works.
+            `Renderer` to control how long. "auto" means "cuda" if it works, otherwise
+            "cpu". "webgpu" draws NumPy arrays on a GPU of any maker, only for pinhole
+            cameras, and only colour and alpha (docs/webgpu.md).
         memory: As in `Renderer`. Each picture waits for all pages that it needs.
 
     Raises:
         ValueError: An argument is invalid, or the coarsest cut has more gaussians than
             the budget. On CUDA, the latter is raised when the picture is used.
-        RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
+        RuntimeError: `device` is "cuda" or "webgpu", and something that it needs is
+            missing.
+        ImportError: `device` is "webgpu", and the package wgpu is missing.
     """
     opened_subject, camera = _with_camera(subject, camera)
     cut_request = CutRequest(tolerance, budget, min_level, fade)
@@ -155,7 +159,7 @@ def render(
         with_depth, sensor = sensor_of(channels, mesh, depth=depth, device=_device.CPU)
         check_rays(color_by, cut, sensor, min_transmittance, memory)
         return draw_rays(opened_subject, camera, cut_request, background, device, depth=with_depth)
-    chosen_device = _device.resolve(device)
+    chosen_device = _device.resolve_for_drawing(device)
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
     with_depth, _ = sensor_of(channels, None, depth=depth)

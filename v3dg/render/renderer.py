@@ -74,7 +74,8 @@ class Renderer:
             GiB. If they do not fit, it means half of the free memory.
 
     Raises:
-        RuntimeError: The device is not available.
+        RuntimeError: The device is not available; for "webgpu", this is raised when the
+            first picture is drawn.
         ValueError: `memory` has no room for the coarsest level, or the coarsest page of
             a file is damaged.
     """
@@ -89,7 +90,11 @@ class Renderer:
     ) -> None:
         self._subject: Subject = opened(subject)
         self._frame = frame_of(
-            self._subject, color_by, _device.resolve(device), pool_bytes(memory), PoolSlot()
+            self._subject,
+            color_by,
+            _device.resolve_for_drawing(device),
+            pool_bytes(memory),
+            PoolSlot(),
         )
         self._steps = _core.BudgetSteps()
         self._has_drawn_batch = False
@@ -209,6 +214,11 @@ class Renderer:
         shade = shade_of(background, min_transmittance, is_asset=False, depth=with_depth)
         cut = CutRequest(tolerance, None, min_level, fade)
         frame = self._frame.chosen(subject)
+        if device.is_webgpu:
+            raise ValueError(
+                "renderer: a batch is drawn on the CPU or with CUDA, got device='webgpu'; draw "
+                "pictures one by one"
+            )
         if not isinstance(frame, SceneFrame):
             raise ValueError(
                 "renderer: a batch needs a scene or a bundle that is resident as a whole; "
