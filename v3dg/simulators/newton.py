@@ -211,9 +211,7 @@ class SplatCamera:
             shape_index_image: (V, H, W) uint32: the shape with the largest weight;
                 `NO_SHAPE` for instances that belong to no shape, and for meshes.
             normal_image: (V, H, W) vec3f in the world.
-            mesh: Meshes among the gaussians; on CUDA devices, meshes and the channels
-                other than depth are drawn as far as `Renderer.render_batch` supports
-                them.
+            mesh: Meshes among the gaussians.
 
         Returns:
             The pictures, NumPy arrays or torch tensors on the model's device.
