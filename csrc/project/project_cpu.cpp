@@ -40,8 +40,10 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
 // Implements project() for one source. `first` is the row of the first gaussian.
 template <class Source, class T, ProjectingModel C>
 static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t first, uint64_t count,
-                           const C& camera, const Window& window, Record<T>* records,
+                           const C& model, const Window& window, Record<T>* records,
                            uint32_t* source, uint32_t source_base, Reach& reach) {
+    // Of a copy, the compiler knows that writing records does not change it.
+    const C camera = model;
     using V = Vec<T>;
     using I = decltype(V{} < V{});
     constexpr int kWidth = kLanes<T>;
