@@ -122,7 +122,7 @@ V3DG_INLINE void store_all(unsigned lanes, const Ellipse<Vec<float>>& e, const V
 // Writes the record of each lane whose bit is set in `lanes`. `records` has room for
 // `count` records, of which the first lanes are the gaussians.
 template <class T, class V, class I>
-V3DG_INLINE void store_records(unsigned lanes, uint64_t count, const Ellipse<V>& e,
+V3DG_INLINE void store_records(unsigned lanes, [[maybe_unused]] uint64_t count, const Ellipse<V>& e,
                                const V color[3], const PixelBox<I>& box, Record<T>* records) {
 #if defined(__SSE2__)
     if constexpr (std::is_same_v<T, float>)
