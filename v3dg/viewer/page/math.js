@@ -3,7 +3,11 @@
 /** @typedef {import("./page.js").Pinhole} Pinhole */
 /** @typedef {import("./page.js").Quaternion} Quaternion */
 /** @typedef {import("./page.js").Vector} Vector */
-/** @typedef {[Vector, Vector, Vector]} Matrix Three rows. */
+/**
+ * A matrix as three rows.
+ *
+ * @typedef {[Vector, Vector, Vector]} Matrix Three rows.
+ */
 
 /** @type {Matrix} */
 const IDENTITY = [
@@ -15,6 +19,8 @@ const IDENTITY = [
 const MOST_SHIFT = 0.7;
 
 /**
+ * Returns a + b.
+ *
  * @template {number[]} V
  * @param {V} a
  * @param {V} b
@@ -24,6 +30,8 @@ export function add(a, b) {
 }
 
 /**
+ * Returns a - b.
+ *
  * @template {number[]} V
  * @param {V} a
  * @param {V} b
@@ -33,6 +41,8 @@ export function sub(a, b) {
 }
 
 /**
+ * Returns the vector times a factor.
+ *
  * @template {number[]} V
  * @param {V} a
  * @param {number} factor
@@ -42,6 +52,8 @@ export function mul(a, factor) {
 }
 
 /**
+ * Returns the dot product.
+ *
  * @param {number[]} a
  * @param {number[]} b
  */
@@ -50,6 +62,8 @@ export function dot(a, b) {
 }
 
 /**
+ * Returns the cross product.
+ *
  * @param {Vector} a
  * @param {Vector} b
  * @returns {Vector}
@@ -58,13 +72,17 @@ export function cross(a, b) {
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
-/** @param {number[]} a */
+/**
+ * Returns the length of a vector.
+ *
+ * @param {number[]} a
+ */
 export function length(a) {
   return Math.hypot(...a);
 }
 
 /**
- * Returns a vector of the same direction with length one; the zero vector stays zero.
+ * Returns a vector of the same direction with length 1. The zero vector is not changed.
  *
  * @template {number[]} V
  * @param {V} a
@@ -86,6 +104,8 @@ export function mix(a, b, t) {
 }
 
 /**
+ * Returns the number in [low, high] that is closest to x.
+ *
  * @param {number} x
  * @param {number} low
  * @param {number} high
@@ -95,6 +115,8 @@ export function clamp(x, low, high) {
 }
 
 /**
+ * Returns whether no component differs by more than `difference`.
+ *
  * @param {number[]} a
  * @param {number[]} b
  * @param {number} difference
@@ -103,18 +125,27 @@ export function isNear(a, b, difference) {
   return a.every((x, i) => Math.abs(x - b[i]) <= difference);
 }
 
-/** @param {number} angle Radians. */
+/**
+ * Converts radians to degrees.
+ *
+ * @param {number} angle In radians.
+ */
 export function degrees(angle) {
   return (angle * 180) / Math.PI;
 }
 
-/** @param {number} angle Degrees. */
+/**
+ * Converts degrees to radians.
+ *
+ * @param {number} angle In degrees.
+ */
 export function radians(angle) {
   return (angle * Math.PI) / 180;
 }
 
 /**
- * Returns the numbers in a text, which are separated by spaces or commas; NaN for other words.
+ * Returns the numbers in a text. They are separated by spaces or commas. A word that is
+ * not a number gives NaN.
  *
  * @param {string} text
  */
@@ -126,7 +157,7 @@ export function numbersOf(text) {
 }
 
 /**
- * Returns a world axis that is not parallel to a direction of length one.
+ * Returns a world axis that is not parallel to a direction of length 1.
  *
  * @param {Vector} direction
  * @returns {Vector}
@@ -153,8 +184,10 @@ export function product(a, b) {
 }
 
 /**
+ * Returns the rotation about an axis of length 1.
+ *
  * @param {Vector} axis
- * @param {number} angle Radians.
+ * @param {number} angle In radians.
  * @returns {Quaternion}
  */
 export function about(axis, angle) {
@@ -162,6 +195,8 @@ export function about(axis, angle) {
 }
 
 /**
+ * Returns the inverse of a rotation.
+ *
  * @param {Quaternion} q
  * @returns {Quaternion}
  */
@@ -170,6 +205,8 @@ export function inverse(q) {
 }
 
 /**
+ * Returns the vector after a rotation.
+ *
  * @param {Quaternion} q
  * @param {Vector} v
  * @returns {Vector}
@@ -198,7 +235,7 @@ export function slerp(a, b, t) {
 }
 
 /**
- * Returns the rotation whose columns are three right-handed axes of length one.
+ * Returns the rotation whose matrix has three right-handed axes of length 1 as columns.
  *
  * @param {Vector} x
  * @param {Vector} y
@@ -221,8 +258,8 @@ export function fromAxes(x, y, z) {
 }
 
 /**
- * Returns the rotation from camera (x right, y down, z forward) to world for a camera that looks
- * along `forward`.
+ * Returns the rotation from the camera's axes (x right, y down, z forward) to the
+ * world, for a camera that looks along `forward`.
  *
  * @param {Vector} forward
  * @param {Vector} up
@@ -236,23 +273,23 @@ export function looking(forward, up) {
 }
 
 /**
- * Returns the homography that shows a picture of one view from another view. It is exact for points
- * on a plane at a distance from the first view.
+ * Returns the homography that shows a picture of one view as seen from another. It is
+ * exact for points on a plane at a given distance from the first view.
  *
  * @param {Pinhole} before
  * @param {Pinhole} now
  * @param {number} distance
- * @param {number} width Width of the element, px.
+ * @param {number} width The width of the element, px.
  * @param {number} height
- * @returns {string | null} The CSS transform of an element whose origin is its upper left
- *   corner; null if the middle of the picture is behind the other view.
+ * @returns {string | null} The CSS transform of an element whose origin is its upper
+ *   left corner. It is null if the middle of the picture is behind the other view.
  */
 export function warp(before, now, distance, width, height) {
   const oldAxes = IDENTITY.map((axis) => rotate(before.wxyz, axis));
   const newAxes = IDENTITY.map((axis) => rotate(now.wxyz, axis));
   const step = sub(before.position, now.position);
   let shift = newAxes.map((axis) => dot(axis, step) / distance);
-  // A plane is a bad approximation for near objects, so the shift is limited.
+  // For near objects, a plane is a bad approximation, so the shift is limited.
   if (length(shift) > MOST_SHIFT) shift = mul(shift, MOST_SHIFT / length(shift));
   const turn = /** @type {Matrix} */ (
     newAxes.map((axis) => oldAxes.map((oldAxis) => dot(axis, oldAxis)))
@@ -276,6 +313,8 @@ export function warp(before, now, distance, width, height) {
 }
 
 /**
+ * Returns the product of two matrices.
+ *
  * @param {Matrix} a
  * @param {Matrix} b
  */
@@ -285,7 +324,11 @@ function times(a, b) {
   );
 }
 
-/** @param {Matrix} homography */
+/**
+ * Returns a homography as text for CSS.
+ *
+ * @param {Matrix} homography
+ */
 function cssTransform([x, y, w]) {
   if (w[2] <= 0.05) return null;
   const columns = [x[0], y[0], 0, w[0], x[1], y[1], 0, w[1], 0, 0, 1, 0, x[2], y[2], 0, w[2]];
