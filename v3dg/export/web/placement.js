@@ -5,7 +5,7 @@
 /**
  * A camera in the OpenCV convention. Matrices are row-major.
  *
- * @typedef {object} Pinhole A camera with the OpenCV convention; matrices are row major.
+ * @typedef {object} Pinhole
  * @property {ArrayLike<number>} viewmat The transform from world to camera, 16 numbers.
  * @property {ArrayLike<number>} k Focal lengths and principal point in px, 9 numbers.
  * @property {number} near Gaussians whose mean has a smaller depth, in world units, are
