@@ -228,7 +228,7 @@ class HeaderReader {
             if (out_.parts.count(member.key) == 0 && member.key != "__metadata__")
                 unknown.insert(member.key);
         if (unknown.empty()) return;
-        fail(quoted(*unknown.begin()) + ": expected only tensors of version " +
+        fail(in_quotes(*unknown.begin()) + ": expected only tensors of version " +
              std::to_string(out_.version) + ", got another one");
     }
 

@@ -106,7 +106,7 @@ std::string text_of_array(const Json::Array& items) {
 std::string text_of_object(const Json::Object& members) {
     std::string text;
     for (const auto& [key, value] : members)
-        text += (text.empty() ? "" : ", ") + quoted(key) + ": " + full_text(value);
+        text += (text.empty() ? "" : ", ") + in_quotes(key) + ": " + full_text(value);
     return "{" + text + "}";
 }
 
@@ -114,7 +114,7 @@ std::string full_text(const Json& json) {
     if (const bool* flag = json.get<bool>()) return *flag ? "true" : "false";
     if (const int64_t* number = json.get<int64_t>()) return std::to_string(*number);
     if (const double* number = json.get<double>()) return text_of(*number);
-    if (const std::string* text = json.get<std::string>()) return quoted(*text);
+    if (const std::string* text = json.get<std::string>()) return in_quotes(*text);
     if (const Json::Array* items = json.get<Json::Array>()) return text_of_array(*items);
     if (const Json::Object* members = json.get<Json::Object>()) return text_of_object(*members);
     return "null";
@@ -122,7 +122,7 @@ std::string full_text(const Json& json) {
 
 }  // namespace
 
-std::string quoted(const std::string& text) {
+std::string in_quotes(const std::string& text) {
     return nlohmann::json(text).dump(-1, ' ', true, nlohmann::json::error_handler_t::replace);
 }
 

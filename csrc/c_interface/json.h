@@ -46,7 +46,7 @@ std::string json_text(const Json* value);
 std::string shortened(const std::string& text);
 
 // Returns a string in quotation marks, in ASCII with escape sequences.
-std::string quoted(const std::string& text);
+std::string in_quotes(const std::string& text);
 
 // Returns whether UTF-8 text fits in one line of a message. It must not have control
 // characters or line separators.

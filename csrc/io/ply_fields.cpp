@@ -59,7 +59,7 @@ Fields fields_of(const PlyElement& vertex) {
         const PlyProperty& property = vertex.properties[p];
         const std::string& name = property.name;
         if (fields.has(name) || fields.lists.count(name))
-            throw PlyError("expected each vertex property once, got " + quoted(name) + " twice");
+            throw PlyError("expected each vertex property once, got " + in_quotes(name) + " twice");
         if (property.is_list) {
             fields.lists.insert(name);
         } else {
@@ -99,7 +99,7 @@ double color_scale(const std::string& name, PlyType type) {
         case PlyType::float32:
         case PlyType::float64: return 1;
         default:
-            throw PlyError("expected a colour " + quoted(name) +
+            throw PlyError("expected a colour " + in_quotes(name) +
                            " of the type uchar, ushort or float, got another type");
     }
 }
@@ -148,7 +148,7 @@ std::string missing_text(const PlyElement& vertex, const Fields& fields,
         text += " and " + std::to_string(missing.size() - kMaxNames) + " more";
     text += ", got ";
     for (size_t i = 0; i < vertex.properties.size() && i < kMaxNames; ++i)
-        text += (i == 0 ? "" : ", ") + quoted(vertex.properties[i].name);
+        text += (i == 0 ? "" : ", ") + in_quotes(vertex.properties[i].name);
     if (vertex.properties.empty()) text += "none";
     if (vertex.properties.size() > kMaxNames)
         text += " and " + std::to_string(vertex.properties.size() - kMaxNames) + " more";
@@ -170,7 +170,8 @@ PlyLayout layout_of(const PlyElement& stored) {
     std::vector<std::string> missing;
     for (const std::string& name : slot_names(fields, num_stored, layout)) {
         if (fields.lists.count(name))
-            throw PlyError("expected a number as vertex property " + quoted(name) + ", got a list");
+            throw PlyError("expected a number as vertex property " + in_quotes(name) +
+                           ", got a list");
         const auto field = fields.field_from_name.find(name);
         if (field != fields.field_from_name.end())
             layout.fields.push_back(field->second);

@@ -76,6 +76,6 @@ File open_ply_file(const char* path);
 PlyHeader read_ply_header(const File& file);
 
 // Returns `text` in quotation marks, shortened and printable, for an error text.
-std::string quoted(const std::string& text);
+std::string in_quotes(const std::string& text);
 
 }  // namespace v3dg

@@ -26,7 +26,7 @@ void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     const size_t left = ply.file_bytes - std::min(offset, ply.file_bytes);
     if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
-                       quoted(element.name) + " with " +
+                       in_quotes(element.name) + " with " +
                        (is_text || element.has_lists() ? "at least " : "") +
                        std::to_string(row_bytes) + " bytes each, got " + std::to_string(left) +
                        " bytes; the file is truncated");

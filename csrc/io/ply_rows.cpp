@@ -125,7 +125,7 @@ class ByteReader {
     void skip(size_t size, const PlyElement& element, uint64_t row) {
         if (size > file_bytes_ - std::min(offset_, file_bytes_))
             throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
-                           quoted(element.name) + ", got the end of the file in row " +
+                           in_quotes(element.name) + ", got the end of the file in row " +
                            std::to_string(row));
         offset_ += size;
     }
@@ -163,8 +163,8 @@ void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool 
                                              property.count_type, is_swapped);
             if (count < 0)
                 throw PlyError("expected a whole number as length of list " +
-                               quoted(property.name) + " in row " + std::to_string(row) + ", got " +
-                               std::to_string(static_cast<int64_t>(count)));
+                               in_quotes(property.name) + " in row " + std::to_string(row) +
+                               ", got " + std::to_string(static_cast<int64_t>(count)));
             reader.skip(static_cast<size_t>(count) * size_of(property.type), element, row);
         } else if (packed != nullptr) {
             const size_t size = size_of(property.type);

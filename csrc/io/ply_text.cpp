@@ -102,7 +102,7 @@ class NumberReader {
         const auto [stop, error] = std::from_chars(first, rest_.begin, value);
         if (error != std::errc() || stop != rest_.begin)
             throw PlyError("vertex " + std::to_string(row_) + ": expected a number, got " +
-                           quoted(std::string(word, rest_.begin)));
+                           in_quotes(std::string(word, rest_.begin)));
         ++num_read_;
         return value;
     }
@@ -110,8 +110,8 @@ class NumberReader {
         const double count = next();
         if (!(count >= 0) || count != std::floor(count))
             throw PlyError("vertex " + std::to_string(row_) +
-                           ": expected a whole number as length of list " + quoted(property.name) +
-                           ", got " + std::to_string(count));
+                           ": expected a whole number as length of list " +
+                           in_quotes(property.name) + ", got " + std::to_string(count));
         for (double i = 0; i < count; ++i) next();
     }
     void expect_end() {
@@ -156,7 +156,7 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
 
 [[noreturn]] void throw_too_few(const PlyElement& element, uint64_t num_lines) {
     throw PlyError("expected " + std::to_string(element.count) + " lines for element " +
-                   quoted(element.name) + ", got " + std::to_string(num_lines));
+                   in_quotes(element.name) + ", got " + std::to_string(num_lines));
 }
 
 }  // namespace
