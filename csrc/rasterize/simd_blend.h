@@ -50,8 +50,7 @@ V3DG_INLINE void prefetch_record(const Record<T>* record) {
 template <class T>
 struct Batch {
     int size;
-    const Record<T>* source[1 + kBatchSize];  // element 0 is only prefetched; the
-                                              // records begin at 1
+    const Record<T>* source[1 + kBatchSize];  // index 1 is the first record
     uint64_t blocks[kBatchSize];              // blocks that each record may change
     BatchRecord<T> record[kBatchSize];
     uint16_t count[kTileBlocks * kTileBlocks];
@@ -112,7 +111,7 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     }
 }
 
-// Return the transmittance below which a live pixel stops.
+// Return the transmittance that live pixels stay above.
 template <class T>
 V3DG_INLINE T least_live(StopsBehind<T> stop) {
     return stop.transmittance;
@@ -122,7 +121,7 @@ V3DG_INLINE T least_live(StopsBefore) {
     return T(kMinTransmittance);
 }
 
-// Blends the batch over one block. Returns whether any pixel of the block continues.
+// Blends the batch over one block. Returns whether any pixel of the block goes on.
 template <class T, Extra kExtra, class Stop>
 V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels,
                              Stop stop, TilePlanes<T>& tile) {
@@ -150,8 +149,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
             const Falloff<V> f = falloff_at(
                 x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v, all_lanes<V>(g.l11),
                 all_lanes<V>(g.l12), all_lanes<V>(g.l22), all_lanes<V>(g.log2_opacity));
-            // Skip vectors without any contribution. If one vector covers a whole
-            // block, this is so rare that the test costs more than it saves.
+            // Skip vectors without any contribution. If a vector covers a whole block,
+            // this is rare, so the test is left out.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
             const V alpha = alpha_of(f), behind = transmittance_behind(alpha, t);
             V weight = alpha * t;

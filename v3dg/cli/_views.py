@@ -82,10 +82,11 @@ class ViewOptions(CameraFile):
     """Draw only this one of several cameras, given by its name or by its number from
     0."""
     views: Annotated[int | None, option("N")] = None
-    """Number of views around an object, or in different directions inside a room. The
-    default is 1, and 8 for `compare`."""
+    """Number of views around an object, or around the viewer inside a room; 1 by
+    default, 8 for `compare`."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
-    """Width and height of pictures, in px, if the file of the camera has no size."""
+    """Width and height in px of pictures for which the file of the camera has no
+    size."""
     elevation: Annotated[float | None, option("DEGREES")] = None
     """Elevation of the cameras around the subject above the horizon, in degrees. The
     default is 20."""

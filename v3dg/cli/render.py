@@ -75,8 +75,8 @@ class Render(Cut, OnPool):
     projection: Literal["pinhole", "equirectangular"] = "pinhole"
     """Draw the view of the camera, or all directions around it. For all directions, the
     width in --size must be twice the height. Gaussians are then evaluated on the ray of
-    each pixel, which needs all of them in memory. With --budget, another --color-by or
-    a pool, the picture is instead combined from 26 pinhole pictures, which is less
+    each pixel, which needs all of them in memory. With --budget, with another
+    --color-by or with a pool, the picture is combined from 26 pinholes, which is less
     exact."""
     fps: Annotated[int, tyro.conf.arg(metavar="N")] = 30
     """Pictures per second of a film."""
@@ -148,7 +148,7 @@ def run(options: Render) -> None:
 
 
 def _casts_rays(options: Render, renderer: Renderer) -> bool:
-    """Return whether panoramas are drawn with rays. Rays support neither budgets nor
+    """Return whether panoramas are drawn with rays, which have neither budgets nor
     false colours, and need all gaussians in memory."""
     is_plain = options.budget is None and options.color_by == "appearance"
     return options.is_panorama and is_plain and renderer.memory is None
