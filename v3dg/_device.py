@@ -1,4 +1,5 @@
-"""Devices: the CPU, with NumPy arrays, and CUDA devices, with torch tensors."""
+"""Devices: the CPU, with NumPy arrays, and CUDA devices, with torch tensors. Pictures
+can also be drawn by WebGPU, into NumPy arrays."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -15,11 +16,12 @@ from v3dg.gaussians import Array, Gaussians
 HostArray: TypeAlias = npt.NDArray[Any]
 
 _MUCH_MEMORY = 1 << 30
+_WEBGPU_NUMBER = -2
 
 
 @dataclass(frozen=True)
 class Device:
-    """The CPU, or a CUDA device with its index."""
+    """The CPU, a CUDA device with its index, or the device of WebGPU."""
 
     number: int = -1
 
@@ -27,9 +29,15 @@ class Device:
     def is_cuda(self) -> bool:
         return self.number >= 0
 
+    @property
+    def is_webgpu(self) -> bool:
+        return self.number == _WEBGPU_NUMBER
+
     def __str__(self) -> str:
         if self.is_cuda:
             return f"cuda:{self.number}"
+        if self.is_webgpu:
+            return "webgpu"
         return "cpu"
 
     def current(self) -> AbstractContextManager[object]:
@@ -43,6 +51,15 @@ class Device:
 
 
 CPU = Device()
+WEBGPU = Device(_WEBGPU_NUMBER)
+
+
+def resolve_for_drawing(device: str | Device) -> Device:
+    """As `resolve`, but accept "webgpu", too. Whether it can be used shows when it
+    draws."""
+    if str(device) == "webgpu":
+        return WEBGPU
+    return resolve(device)
 
 
 def resolve(device: str | Device) -> Device:
@@ -57,6 +74,11 @@ def resolve(device: str | Device) -> Device:
             used instead.
     """
     name = str(device)
+    if name == "webgpu":
+        raise ValueError(
+            "device: 'webgpu' only draws pictures of scenes and bundles with v3dg.render, "
+            "v3dg.Renderer and `v3dg render`; use 'auto', 'cpu' or 'cuda'"
+        )
     kind, _, number = name.partition(":")
     if kind not in ("auto", "cpu", "cuda") or (
         name != kind and (kind != "cuda" or not number.isdecimal())

@@ -23,6 +23,7 @@ EXTRAS = {
     "gymnasium": Extra("gymnasium>=1.1", "environments of Gymnasium"),
     "mujoco": Extra("mujoco>=3.2", "MuJoCo"),
     "newton": Extra("newton>=1.8", "Newton"),
+    "wgpu": Extra("wgpu>=0.32", "pictures by WebGPU"),
     "distributed": Extra("distributed>=2024.1", "builds on many machines"),
 }
 """Optional packages, by the names of their modules."""

@@ -30,6 +30,15 @@ class _Tensor(Protocol):
 def floats(values: object, name: str, expected: str = "numbers") -> Floats:
     """Convert numbers, an array or a torch tensor to a new array of doubles. Raise
     ValueError unless all values are finite."""
+    array = doubles(values, name, expected)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
+    return array
+
+
+def doubles(values: object, name: str, expected: str = "numbers") -> Floats:
+    """Return numbers, an array or a torch tensor as a new array of doubles, which may
+    be infinite or NaN."""
     try:
         if hasattr(values, "detach"):
             array = np.asarray(cast(_Tensor, values).numpy(force=True))
@@ -49,8 +58,6 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
         if dtype is not None:
             kind = f"{kind} of {dtype}"
         raise ValueError(f"{name}: expected {expected}, got {kind}") from None
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
     return array
 
 

@@ -219,3 +219,19 @@ class RenderedImage(Image):
     @property
     def stats(self) -> Stats:
         return self._finish()
+
+
+class FinishedImage(RenderedImage):
+    """A picture that was drawn without the core."""
+
+    def __init__(self, planes: Planes, stats: Stats) -> None:
+        self._drawn = planes
+        self._finished_stats = stats
+
+    @property
+    def _planes(self) -> Planes | _core.Drawing | _core.Picture:
+        return self._drawn
+
+    @property
+    def stats(self) -> Stats:
+        return self._finished_stats

@@ -10,7 +10,7 @@ import numpy as np
 
 from v3dg import _device
 from v3dg._device import CPU
-from v3dg._numbers import Floats, check, check_type, floats
+from v3dg._numbers import Floats, check, check_type, doubles
 from v3dg.opening import File, opened
 from v3dg.render.rays import cast_rays
 from v3dg.render.request import CutRequest
@@ -206,7 +206,7 @@ def scan(
 def _poses_of(pose: _Poses, device: Device) -> tuple[Array, bool]:
     """Return (B, 4, 4) poses, and whether a single pose was given."""
     if not getattr(pose, "is_cuda", False):
-        matrices = floats(pose, "pose")
+        matrices = doubles(pose, "pose")
         if matrices.ndim != 3:
             return checked_pose(matrices, "pose")[None], True
         for number, matrix in enumerate(matrices):

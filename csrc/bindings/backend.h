@@ -210,8 +210,7 @@ class Frame {
 class AssetFrame {
   public:
     virtual ~AssetFrame() = default;
-    // Like Frame::draw(), for one camera. The channel `clipped` is only requested if
-    // draws_only_plainly is false.
+    // Like Frame::draw(), for one camera.
     virtual std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                                const SensorRequest& sensor,
                                                const std::atomic<bool>* stop) = 0;

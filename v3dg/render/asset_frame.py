@@ -63,7 +63,10 @@ class AssetFrame:
         check_request(request.cut)
         camera = request.camera
         if isinstance(camera, StereoCamera):
-            left, right = (self._draw_eye(eye, request, stop) for eye in camera.eyes)
+            left, right = (
+                self._draw_eye(eye, request.of_eye(number), stop)
+                for number, eye in enumerate(camera.eyes)
+            )
             return left, right
         return self._draw_eye(camera, request, stop)
 

@@ -12,7 +12,7 @@ from v3dg import _core
 from v3dg._device import Device
 from v3dg._numbers import Floats, check, check_type
 from v3dg.camera_batch import CameraBatch, form_of
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, StereoCamera
 from v3dg.image import ChannelPlanes, Planes, RenderedImage, Sensed, Stats
 from v3dg.render.request import CutRequest
 
@@ -335,11 +335,10 @@ def check_planes(planes: BatchPlanes | None, *, with_depth: bool) -> None:
     check("out", planes.depth is not None or not with_depth, "planes with depth, got none")
 
 
-def are_alike(cameras: Sequence[Camera]) -> bool:
+def are_alike(cameras: Sequence[Camera | StereoCamera]) -> bool:
     """Return whether cameras can be drawn as one batch. There must be at least two
     pinhole cameras of one size and one near plane."""
-    if len(cameras) < 2 or any(type(camera) is not Camera for camera in cameras):
+    pinholes = [camera for camera in cameras if type(camera) is Camera and not camera.is_distorted]
+    if len(cameras) < 2 or len(pinholes) < len(cameras):
         return False
-    if any(camera.is_distorted for camera in cameras):
-        return False
-    return len({form_of(camera) for camera in cameras}) == 1
+    return len({form_of(camera) for camera in pinholes}) == 1

@@ -17,6 +17,7 @@ from v3dg.render.picture import Picture
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import CutRequest, FrameRequest
 from v3dg.render.scene_frame import SceneFrame
+from v3dg.render.webgpu.frame import WebGpuFrame, check_subject
 from v3dg.residency import ResidentScene, residency
 
 if TYPE_CHECKING:
@@ -128,6 +129,9 @@ def frame_of(
         ValueError: `color_by` or `memory` is invalid; see `v3dg.Renderer`.
     """
     one_of(color_by, "color_by", get_args(ColorBy))
+    if device.is_webgpu:
+        check_subject(subject, color_by, memory)
+        return WebGpuFrame()
     if isinstance(subject, Gaussians):
         is_without = memory is None or memory == "auto"
         check(

@@ -148,6 +148,11 @@ def draw_rays(
     """Draw an equirectangular picture. Its depth is the mean distance along the ray,
     weighted by blend weights."""
     back_color = color_of(background, "background")
+    if str(device) == "webgpu":
+        raise ValueError(
+            "camera: expected a pinhole with device='webgpu', got an EquirectangularCamera; use "
+            "'cpu' or 'cuda'"
+        )
     chosen_device = _device.resolve(device)
     cast = cast_rays(subject, camera.core, camera.sensor_viewmat[None], cut, chosen_device)
     color = cast.color[0]

@@ -20,7 +20,7 @@ from v3dg.render.frame import frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, sensor_of
+from v3dg.render.sensor import Channel, Meshes, sensor_of
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
 
@@ -36,7 +36,7 @@ class _Options(CutOptions, total=False):
     min_transmittance: float | None
     depth: bool
     channels: Sequence[Channel]
-    mesh: MeshLayer | None
+    mesh: Meshes | None
 
 
 class Renderer:
@@ -74,7 +74,8 @@ class Renderer:
             GiB. If they do not fit, it means half of the free memory.
 
     Raises:
-        RuntimeError: The device is not available.
+        RuntimeError: The device is not available; for "webgpu", this is raised when the
+            first picture is drawn.
         ValueError: `memory` has no room for the coarsest level, or the coarsest page of
             a file is damaged.
     """
@@ -89,7 +90,11 @@ class Renderer:
     ) -> None:
         self._subject: Subject = opened(subject)
         self._frame = frame_of(
-            self._subject, color_by, _device.resolve(device), pool_bytes(memory), PoolSlot()
+            self._subject,
+            color_by,
+            _device.resolve_for_drawing(device),
+            pool_bytes(memory),
+            PoolSlot(),
         )
         self._steps = _core.BudgetSteps()
         self._has_drawn_batch = False
@@ -138,7 +143,7 @@ class Renderer:
         min_transmittance: float | None = None,
         depth: bool = False,
         channels: Sequence[Channel] = (),
-        mesh: MeshLayer | None = None,
+        mesh: Meshes | None = None,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
         """Draw a picture with what is resident. The arguments are those of
         `v3dg.render`."""
@@ -146,7 +151,7 @@ class Renderer:
         subject = self._subject
         is_asset = isinstance(subject, Gaussians)
         device = self._frame.device
-        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=device)
+        with_depth, sensor = sensor_of(channels, mesh, depth=depth, device=device)
         shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
         cut_request = CutRequest(tolerance, budget, min_level, fade)
         request = FrameRequest(camera, cut_request, shade, cut, sensor=sensor)
@@ -163,7 +168,7 @@ class Renderer:
         min_transmittance: float | None = None,
         depth: bool = False,
         channels: Sequence[Channel] = (),
-        mesh: MeshLayer | None = None,
+        mesh: Meshes | None = None,
         out: BatchPlanes | None = None,
     ) -> RenderedBatch:
         """Draw a picture for each of many cameras of one size, in one call. Cuts and
@@ -189,7 +194,7 @@ class Renderer:
             background: As in `v3dg.render`; so are `min_transmittance` and `depth`.
             channels: As in `v3dg.render`. Channels without planes in `out` are new
                 arrays.
-            mesh: As in `v3dg.render`, with planes (B, H, W).
+            mesh: As in `v3dg.render` for a list of cameras.
             out: Where to write colour and, if it has planes for them, alpha, depth and
                 channels. The planes belong to the caller. They are valid after the
                 result was read or, on the same stream, as soon as the buffers are large
@@ -203,12 +208,17 @@ class Renderer:
         if not isinstance(cameras, CameraBatch):
             cameras = CameraBatch.of(cameras)
         device = self._frame.device
-        with_depth, sensor = sensor_of(channels, mesh, cameras, depth=depth, device=device)
+        with_depth, sensor = sensor_of(channels, mesh, depth=depth, device=device)
         check_planes(out, with_depth=with_depth)
         subject = self._subject
         shade = shade_of(background, min_transmittance, is_asset=False, depth=with_depth)
         cut = CutRequest(tolerance, None, min_level, fade)
         frame = self._frame.chosen(subject)
+        if device.is_webgpu:
+            raise ValueError(
+                "renderer: a batch is drawn on the CPU or with CUDA, got device='webgpu'; draw "
+                "pictures one by one"
+            )
         if not isinstance(frame, SceneFrame):
             raise ValueError(
                 "renderer: a batch needs a scene or a bundle that is resident as a whole; "

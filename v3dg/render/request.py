@@ -129,6 +129,12 @@ class FrameRequest(NamedTuple):
     look: Look | None = None
     sensor: _core.Sensor | None = None
 
+    def of_eye(self, number: int) -> FrameRequest:
+        """Return the request of a stereo camera with the meshes of one eye."""
+        if self.sensor is None:
+            return self
+        return self._replace(sensor=self.sensor.of_eye(number))
+
 
 def shade_of(
     background: Sequence[float], min_transmittance: float | None, *, is_asset: bool, depth: bool

@@ -60,7 +60,8 @@ class SceneFrame(ResidentFrame):
         if selection is not None:
             if isinstance(camera, StereoCamera):
                 left, right = (
-                    self._draw_given(subject, request, selection, eye, stop) for eye in camera.eyes
+                    self._draw_given(subject, request.of_eye(number), selection, eye, stop)
+                    for number, eye in enumerate(camera.eyes)
                 )
                 return left, right
             return self._draw_given(subject, request, selection, camera, stop)
@@ -107,7 +108,7 @@ class SceneFrame(ResidentFrame):
         """Draw a cut that was selected earlier."""
         with residency.turn(self.device):
             resident = self._taken(subject)
-            _check_cut(cut, subject, resident, request.cut)
+            check_cut(cut, subject, resident, request.cut)
             weights = None
             if cut.given_weights is not None:
                 weights = self._on_device(cut.given_weights)
@@ -136,7 +137,7 @@ class SceneFrame(ResidentFrame):
         return torch.tensor(values, device=str(self.device))
 
 
-def _check_cut(
+def check_cut(
     cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest
 ) -> None:
     """Raise ValueError if a cut was not selected from the current scene, or if other
