@@ -284,7 +284,7 @@ class BoundSceneFrame {
                                       ", as the scene has, got " + std::to_string(environment[b]));
     }
 
-    // Checks that the scene, the request and the pool match each other. Then calls
+    // Checks that the scene, the request and the pool fit each other, then calls
     // body(input).
     template <class Body>
     void with_input(const py::object& scene_object, const py::object& request_object,

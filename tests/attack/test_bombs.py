@@ -1,9 +1,6 @@
 """Small files that claim or expand to much. The memory of readers stays below the
 limits in docs/robustness.md. A separate process reads each file within a minute, and
 the system measures its peak memory.
-
-Each is read by a process of its own, whose largest memory the system measures, and
-which has a minute.
 """
 
 import gzip

@@ -1,9 +1,6 @@
 """Every value in the JSON of every kind of file is replaced by values of other types.
 Each changed file is read, or its reader refuses it with a ValueError of one line that
 begins with the file's name.
-
-Each file is then read, or refused with the ValueError of its reader, in one line that
-begins with the file.
 """
 
 import copy

@@ -4,12 +4,6 @@ SUPERSPLAT_VIEWER is the folder `public` of `npm install
 @playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file `build/playcanvas.min.mjs` of
 `npm install playcanvas@2.23.3`, and CESIUM the folder `Build/Cesium` of `npm install
 cesium@1.145.0`.
-
-They need playwright, Chromium where PATH finds it, and what environment variables name:
-SUPERSPLAT_VIEWER the folder `public` of `npm install
-@playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file `build/playcanvas.min.mjs` of
-`npm install playcanvas@2.23.3`, CESIUM the folder `Build/Cesium` of `npm install
-cesium@1.145.0`.
 """
 
 import functools

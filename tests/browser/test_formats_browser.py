@@ -4,12 +4,6 @@ NODE_MODULES. This is the folder that `npm install playcanvas@2.23.3 three@0.187
 @sparkjsdev/spark@2.2.0 babylonjs@9.28.0 babylonjs-loaders@9.28.0 @adobe/spz@0.2.2
 fflate@0.8.3` creates. If SCREENSHOTS names a folder, the pictures of the engines and
 ours are saved there.
-
-They need playwright, Chromium where PATH finds it, and the environment variable
-NODE_MODULES, which names the folder that `npm install playcanvas@2.23.3 three@0.187.0
-@sparkjsdev/spark@2.2.0 babylonjs@9.28.0 babylonjs-loaders@9.28.0 @adobe/spz@0.2.2
-fflate@0.8.3` makes. With SCREENSHOTS, the name of a folder, the pictures are left
-there, ours beside them.
 """
 
 import dataclasses

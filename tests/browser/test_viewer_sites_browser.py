@@ -2,10 +2,6 @@
 of a picture. The tests need playwright, and Chromium on PATH. The other page has
 another port, and either the viewer's host name, which the browser treats as the same
 site, or another name, which is a cross site.
-
-Needs playwright, and Chromium where PATH finds it. The other page is at another port,
-under the viewer's name (the browser calls that the same site) and under another one (a
-cross site).
 """
 
 import http.server

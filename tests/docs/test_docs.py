@@ -1,9 +1,6 @@
 """Every block of code in the README and in docs/ runs, with small files instead of
 large ones. A comment before a block tells what it needs: <!-- test: gpu -->, <!-- test:
 needs MODULE -->, or <!-- test: skip, REASON -->.
-
-A comment before a block says what else it takes: <!-- test: gpu -->, <!-- test: needs
-MODULE -->, or <!-- test: skip, REASON -->.
 """
 
 import json

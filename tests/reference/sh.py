@@ -39,8 +39,6 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
 def color(sh: np.ndarray, directions: np.ndarray, degree: int | None = None) -> np.ndarray:
     """Return (N,3) colours: the series of sh (N,K,3) up to the degree, plus one half,
     at least 0. Values that are not finite become 0.
-
-    What is not finite is 0.
     """
     sh = np.asarray(sh, np.float64)
     if degree is None:

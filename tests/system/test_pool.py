@@ -212,8 +212,6 @@ def test_frames_become_finer_until_nothing_is_missing(scene, device):
 def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, most):
     """The number is the number of bytes that are needed, divided by the eighth of the
     pool that is loaded at once, plus one. Pages of all 13 levels are requested at once.
-
-    Pages of all levels are asked for at once: there are 13 of them.
     """
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     rng = np.random.default_rng(0)

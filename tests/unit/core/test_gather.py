@@ -90,9 +90,6 @@ def test_harmonics_turn_as_the_bases_do(device, degree):
     """The precision is 1e-12 although results are float32, because all but one
     coefficient of a band nearly vanish. As coefficients of the asset, each row of the
     exact rotation becomes one basis function in the world, up to rounding.
-
-    A row of the exact rotation, as coefficients of the asset, is one basis function in
-    the world, up to rounding.
     """
     rng = np.random.default_rng(degree)
     count, size, first = 50, 2 * degree + 1, degree * degree
