@@ -10,7 +10,7 @@ import numpy as np
 
 from v3dg import _device
 from v3dg._device import CPU
-from v3dg._numbers import Floats, check, check_type, floats
+from v3dg._numbers import Floats, check, check_type, doubles
 from v3dg.opening import File, opened
 from v3dg.render.rays import cast_rays
 from v3dg.render.request import CutRequest

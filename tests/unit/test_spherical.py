@@ -392,6 +392,12 @@ ERRORS = {
     "pose[1]: expected the last row": lambda: v3dg.scan(
         dot((1, 0, 0)), LIDAR, [np.eye(4), np.ones((4, 4))]
     ),
+    "pose[2]: expected finite numbers, got nan": lambda: v3dg.scan(
+        dot((1, 0, 0)), LIDAR, [np.eye(4), np.eye(4), np.full((4, 4), math.nan)]
+    ),
+    "pose: expected finite numbers, got inf": lambda: v3dg.scan(
+        dot((1, 0, 0)), LIDAR, np.full((4, 4), math.inf)
+    ),
     "budget: expected none": lambda: v3dg.render(
         dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), budget=3
     ),
