@@ -29,7 +29,6 @@ const EASE_SECONDS = 0.07;
 
 /**
  * Returns whether a text is the name of a mode.
- *
  * @param {string} text
  * @returns {text is Mode}
  */
@@ -44,11 +43,7 @@ export class Camera {
   wxyz = M.looking([0, 3, -1], [0, 0, 1]);
   /** Vertical field of view, radians. */
   fov_y = Math.PI / 4;
-  /**
-   * The point that the camera orbits.
-   *
-   * @type {Vector}
-   */
+  /** @type {Vector} The point that the camera orbits. */
   focus = [0, 0, 0];
   /** @type {Vector} */
   up = [0, 0, 1];
@@ -60,7 +55,6 @@ export class Camera {
   radius = 1;
   /**
    * Distance to the object in the middle of the picture; null if it is unknown.
-   *
    * @type {number}
    */
   ahead = null;
@@ -71,7 +65,6 @@ export class Camera {
   /**
    * The current flight to another view, with the seconds since its start; null if there
    * is none.
-   *
    * @type {{ from: FlightEnd, to: FlightEnd, seconds: number }}
    */
   flight = null;
@@ -111,7 +104,6 @@ export class Camera {
 
   /**
    * Returns the camera's view, for a picture of this aspect ratio.
-   *
    * @param {number} aspect
    */
   view(aspect) {
@@ -120,7 +112,6 @@ export class Camera {
 
   /**
    * Returns whether a view equals the camera's view, except for rounding.
-   *
    * @param {Pinhole} view
    */
   isAt(view) {
@@ -132,7 +123,6 @@ export class Camera {
 
   /**
    * Sets the factor of the speed, within its limits.
-   *
    * @param {number} speed
    */
   setSpeed(speed) {
@@ -143,7 +133,6 @@ export class Camera {
   /**
    * Turns the camera by a yaw around the up axis and a pitch around the horizontal
    * axis. In orbit mode, the camera moves around the focus.
-   *
    * @param {number} yaw In radians.
    * @param {number} pitch In radians.
    */
@@ -160,7 +149,6 @@ export class Camera {
 
   /**
    * Sets the rotation of the camera. In orbit mode, the camera moves around the focus.
-   *
    * @param {Quaternion} rotation
    */
   rotate(rotation) {
@@ -176,7 +164,6 @@ export class Camera {
 
   /**
    * Moves by distances along the camera's axes.
-   *
    * @param {number} right
    * @param {number} down
    * @param {number} forward
@@ -189,7 +176,6 @@ export class Camera {
 
   /**
    * Moves the camera by a vector.
-   *
    * @param {Vector} step The vector in world coordinates.
    */
   moveBy(step) {
@@ -200,7 +186,6 @@ export class Camera {
   /**
    * Multiplies the distance to the focus by a factor. If the camera reaches the focus,
    * the focus is moved ahead.
-   *
    * @param {number} factor The factor of the distance.
    */
   approach(factor) {
@@ -223,7 +208,6 @@ export class Camera {
 
   /**
    * Moves the camera for some time.
-   *
    * @param {Vector} push Movement to the right, up and forward; each is -1 to 1.
    * @param {number} seconds
    */
@@ -253,7 +237,6 @@ export class Camera {
   /**
    * Moves the camera to a view without a flight. The focus is placed in front of the
    * camera, at the same distance as before.
-   *
    * @param {Pinhole} view
    */
   put(view) {
@@ -268,7 +251,6 @@ export class Camera {
 
   /**
    * Starts a flight to a view.
-   *
    * @param {Pinhole} view
    * @param {Vector | null} focus The focus of the view; null for a point in front of
    *   it.
@@ -283,7 +265,6 @@ export class Camera {
   /**
    * Starts a flight to a view of a point. The camera stays on the side of the point
    * where it is now.
-   *
    * @param {Vector} point
    * @param {number} distance
    */
@@ -295,8 +276,6 @@ export class Camera {
   }
 
   /**
-   * Advances a flight.
-   *
    * @param {number} seconds The time since the last call.
    */
   advance(seconds) {

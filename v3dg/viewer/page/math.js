@@ -3,11 +3,7 @@
 /** @typedef {import("./page.js").Pinhole} Pinhole */
 /** @typedef {import("./page.js").Quaternion} Quaternion */
 /** @typedef {import("./page.js").Vector} Vector */
-/**
- * A matrix as three rows.
- *
- * @typedef {[Vector, Vector, Vector]} Matrix Three rows.
- */
+/** @typedef {[Vector, Vector, Vector]} Matrix Three rows. */
 
 /** @type {Matrix} */
 const IDENTITY = [
@@ -19,8 +15,6 @@ const IDENTITY = [
 const MOST_SHIFT = 0.7;
 
 /**
- * Returns a + b.
- *
  * @template {number[]} V
  * @param {V} a
  * @param {V} b
@@ -30,8 +24,6 @@ export function add(a, b) {
 }
 
 /**
- * Returns a - b.
- *
  * @template {number[]} V
  * @param {V} a
  * @param {V} b
@@ -41,8 +33,6 @@ export function sub(a, b) {
 }
 
 /**
- * Returns the vector times a factor.
- *
  * @template {number[]} V
  * @param {V} a
  * @param {number} factor
@@ -52,8 +42,6 @@ export function mul(a, factor) {
 }
 
 /**
- * Returns the dot product.
- *
  * @param {number[]} a
  * @param {number[]} b
  */
@@ -62,8 +50,6 @@ export function dot(a, b) {
 }
 
 /**
- * Returns the cross product.
- *
  * @param {Vector} a
  * @param {Vector} b
  * @returns {Vector}
@@ -73,8 +59,6 @@ export function cross(a, b) {
 }
 
 /**
- * Returns the length of a vector.
- *
  * @param {number[]} a
  */
 export function length(a) {
@@ -83,7 +67,6 @@ export function length(a) {
 
 /**
  * Returns a vector of the same direction with length 1. The zero vector is not changed.
- *
  * @template {number[]} V
  * @param {V} a
  */
@@ -93,7 +76,6 @@ export function unit(a) {
 
 /**
  * Interpolates linearly from `a` (t = 0) to `b` (t = 1).
- *
  * @template {number[]} V
  * @param {V} a
  * @param {V} b
@@ -105,7 +87,6 @@ export function mix(a, b, t) {
 
 /**
  * Returns the number in [low, high] that is closest to x.
- *
  * @param {number} x
  * @param {number} low
  * @param {number} high
@@ -116,7 +97,6 @@ export function clamp(x, low, high) {
 
 /**
  * Returns whether no component differs by more than `difference`.
- *
  * @param {number[]} a
  * @param {number[]} b
  * @param {number} difference
@@ -126,8 +106,6 @@ export function isNear(a, b, difference) {
 }
 
 /**
- * Converts radians to degrees.
- *
  * @param {number} angle In radians.
  */
 export function degrees(angle) {
@@ -135,8 +113,6 @@ export function degrees(angle) {
 }
 
 /**
- * Converts degrees to radians.
- *
  * @param {number} angle In degrees.
  */
 export function radians(angle) {
@@ -146,7 +122,6 @@ export function radians(angle) {
 /**
  * Returns the numbers in a text. They are separated by spaces or commas. A word that is
  * not a number gives NaN.
- *
  * @param {string} text
  */
 export function numbersOf(text) {
@@ -158,7 +133,6 @@ export function numbersOf(text) {
 
 /**
  * Returns a world axis that is not parallel to a direction of length 1.
- *
  * @param {Vector} direction
  * @returns {Vector}
  */
@@ -169,7 +143,6 @@ export function axisAcross(direction) {
 
 /**
  * Returns the rotation by `b`, followed by the rotation by `a`.
- *
  * @param {Quaternion} a
  * @param {Quaternion} b
  * @returns {Quaternion}
@@ -185,7 +158,6 @@ export function product(a, b) {
 
 /**
  * Returns the rotation about an axis of length 1.
- *
  * @param {Vector} axis
  * @param {number} angle In radians.
  * @returns {Quaternion}
@@ -196,7 +168,6 @@ export function about(axis, angle) {
 
 /**
  * Returns the inverse of a rotation.
- *
  * @param {Quaternion} q
  * @returns {Quaternion}
  */
@@ -206,7 +177,6 @@ export function inverse(q) {
 
 /**
  * Returns the vector after a rotation.
- *
  * @param {Quaternion} q
  * @param {Vector} v
  * @returns {Vector}
@@ -218,7 +188,6 @@ export function rotate(q, v) {
 
 /**
  * Interpolates from `a` (t = 0) to `b` (t = 1) along the shorter arc.
- *
  * @param {Quaternion} a
  * @param {Quaternion} b
  * @param {number} t
@@ -236,7 +205,6 @@ export function slerp(a, b, t) {
 
 /**
  * Returns the rotation whose matrix has three right-handed axes of length 1 as columns.
- *
  * @param {Vector} x
  * @param {Vector} y
  * @param {Vector} z
@@ -260,7 +228,6 @@ export function fromAxes(x, y, z) {
 /**
  * Returns the rotation from the camera's axes (x right, y down, z forward) to the
  * world, for a camera that looks along `forward`.
- *
  * @param {Vector} forward
  * @param {Vector} up
  */
@@ -275,7 +242,6 @@ export function looking(forward, up) {
 /**
  * Returns the homography that shows a picture of one view as seen from another. It is
  * exact for points on a plane at a given distance from the first view.
- *
  * @param {Pinhole} before
  * @param {Pinhole} now
  * @param {number} distance
@@ -313,8 +279,6 @@ export function warp(before, now, distance, width, height) {
 }
 
 /**
- * Returns the product of two matrices.
- *
  * @param {Matrix} a
  * @param {Matrix} b
  */
@@ -326,7 +290,6 @@ function times(a, b) {
 
 /**
  * Returns a homography as text for CSS.
- *
  * @param {Matrix} homography
  */
 function cssTransform([x, y, w]) {
