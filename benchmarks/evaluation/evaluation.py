@@ -33,7 +33,7 @@ from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-FOV_X = math.pi / 4  # in radians
+FOV_X = math.pi / 4  # horizontal field of view in the paper, in radians
 _MOST_PICTURE_PX = 1400, 2000
 PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
 

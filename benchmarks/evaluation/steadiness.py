@@ -32,7 +32,7 @@ SUPERSAMPLING = 4
 # Motion per frame as a fraction of the distance, so slow that only pops appear to move.
 _DRIFT = 5e-4
 _ZOOM = 5e-3
-_TURN = 5e-4  # in radians
+_TURN = 5e-4  # rotation per frame in radians
 _SHAKE = 2e-3  # amplitude of the shaking as a fraction of the distance
 # Frames per period of the two waves of a shaking hand. The periods differ, so that the
 # waves do not coincide.

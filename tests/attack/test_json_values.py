@@ -18,7 +18,8 @@ from gltf_files import file_of_every_part
 from random_bundle import random_gaussians
 from v3dg._json import is_one_line
 
-LONG = "a number of 5,000 digits"  # stands for an exchanged value
+# placeholder for a value that JSON writes with 5,000 digits
+LONG = "a number of 5,000 digits"
 ODD = [[], [26], [[]], [None], {}, {"a": 1}, None, True, False, "", "a", "0", "\x1b[31m", LONG]
 ODD += [
     0,
@@ -178,7 +179,8 @@ def kind(request, tmp_path):
     return json_kind(tmp_path, good, read)
 
 
-@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")  # read_both reads notes
+# read_both also reads data that cause warnings
+@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")
 def test_every_value_of_another_kind_is_named(kind):
     faults = []
     for document, change in variants(kind.document):

@@ -37,9 +37,9 @@ pytestmark = [
 ]
 
 SIDE, FOV = 300, 40
-EYE = (0.18, -0.38, 0.30)  # axis of the donut that points up
+EYE = (0.18, -0.38, 0.30)  # z of the donut points up
 UP = (0.0, 0.0, 1.0)
-# The axes of files whose asset is turned; z is up in the donut.
+# The axes of the formats in which assets are rotated. In the donut, z is up.
 AXES = {".spz": _axes.OPENGL, ".glb": _axes.GLTF}
 
 # Each page looks from EYE at the origin with UP up, and counts its pictures since the
@@ -136,7 +136,7 @@ engine.runRenderLoop(() => { scene.render(); window.frames_shown++; });
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves files and logs nothing."""
+    """A web server of files that logs nothing."""
 
     def log_message(self, *_):
         pass

@@ -33,7 +33,7 @@ BLOCK = re.compile(
 @dataclass
 class Block:
     page: str
-    line: int  # line number in the page of the first line of code
+    line: int  # line number, in the file, of the block's first line of code
     kind: str
     code: str
     how: list[str]  # words of the comment before the block

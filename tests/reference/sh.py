@@ -1,8 +1,8 @@
 """Real spherical harmonics up to degree 3, from their definition by Legendre
 polynomials, in float64.
 
-Order and signs are those of 3DGS files: within degree l the orders m = -l..l, with the
-Condon-Shortley phase.
+Order and signs are those of 3DGS files. Within degree l, the orders are m = -l..l, with
+the Condon-Shortley phase.
 """
 
 from __future__ import annotations

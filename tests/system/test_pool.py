@@ -45,8 +45,11 @@ def path(asset, tmp_path):
 
 @pytest.fixture(params=["mixed", "coded"])
 def scene(request, asset, path):
-    """Return a scene of instances of files with different SH degrees, stored as codes.
-    With `rows`, also add files with rows and a bundle in memory."""
+    """Return a scene of instances of files with different SH degrees.
+
+    If the parameter is "coded", all files store codes. Otherwise, they store rows, and
+    a bundle in memory is added.
+    """
     rng, scene = np.random.default_rng(1), Scene()
     is_coded = request.param == "coded"
     many = coded(asset, path.with_name("many.v3dg")) if is_coded else Bundle.open(path)
@@ -66,8 +69,8 @@ def coded(bundle, path):
 
 
 def scaled(scene, memory):
-    """Return the size of a pool of codes that holds about as many gaussians as a pool
-    of rows of this size."""
+    """Return the size of a pool that holds about as many gaussians of this scene as a
+    pool of the size `memory` holds rows."""
     return (
         memory if any(bundle.codec == "float32" for bundle in scene.bundles) else int(0.3 * memory)
     )
