@@ -76,9 +76,9 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
         accessors.append(_accessor(name, values, view))
     extension: JsonObject = {}
     if not compressed:
-        # These properties are left out of compressed files. Readers that follow the
-        # release would otherwise convert the axes of the `.spz`, which CesiumJS never
-        # does.
+        # Compressed files lack these properties. With them, readers that implement the
+        # released extension would convert the axes of the `.spz`, but CesiumJS would
+        # not.
         extension |= {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     if host.antialiased is not None:
         extension["extras"] = {"antialiased": host.antialiased}
