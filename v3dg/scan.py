@@ -168,12 +168,12 @@ def scan(
     be in progress on torch's current stream.
 
     Args:
-        subject: What to scan, in world space; or its file, which every call opens
-            again.
-        pose: (4, 4) sensor to world, a rotation and a translation; or (B, 4, 4). The
-            sensor has x forward (azimuth 0), y left and z up. Torch tensors of float32
-            or float64 on the CUDA device that scans stay there and are not checked: a
-            sensor whose pose is no rigid motion sees nothing.
+        subject: What to scan, in world space. If it is the path of a file, every call
+            opens the file again.
+        pose: (4, 4) or (B, 4, 4) from sensor to world, a rotation and a translation.
+            The sensor has x forward (azimuth 0), y left and z up. A float32 or float64
+            torch tensor on the CUDA device that scans stays there and is not checked.
+            If such a pose is not a rigid motion, its rays hit nothing.
         tolerance, min_level: As in `v3dg.select`, with `Lidar.spacing` as the size of a
             pixel.
         device: As in `v3dg.render`.
@@ -192,7 +192,7 @@ def scan(
     viewmats = _viewmats(poses)
     size = max(1, len(poses))
     if not chosen_device.is_cuda:
-        size = 1  # so that the program can be interrupted between poses
+        size = 1  # one pose at a time, so that the program can be interrupted
     casts = [
         cast_rays(content, lidar.core, viewmats[first : first + size], cut, chosen_device, returns)
         for first in range(0, max(1, len(poses)), size)

@@ -3,9 +3,8 @@
     taskset -c 0,1 python -m benchmarks.studies.cpu_frames \\
         --layout donutsea.json --bundles draft.v3dg standard.v3dg -o cpu_frames
 
-Each bundle has a renderer. The renderers draw the same camera in turn. The study
-reports the minimum and the median of the frame times in milliseconds, without the first
-frame.
+Each bundle has a renderer, and the renderers draw one camera by turns. The times are
+milliseconds of the frames after the first; the least, and the median.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Poses on the device: (B, 4, 4) transforms from the world to the sensor. If a pose is
-// not a rigid motion, its rays hit nothing.
+// Poses on the device: (B, 4, 4) from the world to the sensor. At a pose that is no
+// rigid motion, the sensor sees nothing.
 struct RayPoses {
     const void* viewmats;
     bool are_double;

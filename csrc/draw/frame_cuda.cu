@@ -113,10 +113,11 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Growing a buffer that moves takes as long as drawing several frames, and a frame
-    // that exceeds a buffer is drawn twice. So buffers grow before a moving camera
-    // exceeds them. All buffers that are nearly full grow together, by more than the
-    // counts require; by less if they grow in place.
+    // Growing a buffer by moving it takes as long as drawing several frames, and a
+    // frame that exceeds a buffer is drawn twice. Therefore buffers are enlarged before
+    // a moving camera exceeds them. All buffers that are nearly full grow at once, and
+    // by more than the counts require. Buffers that grow in place are cheap to enlarge,
+    // so they grow by less.
     const auto is_full = [](unsigned long long capacity, unsigned long long count,
                             unsigned free_part) { return count > capacity - capacity / free_part; };
     const bool grows = is_full(capacity_.items, counters.items, 32) ||
@@ -130,8 +131,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     const auto grow = [is_full, part](unsigned long long& capacity, unsigned long long count) {
         if (is_full(capacity, count, part)) capacity = std::max(capacity, count + count / part);
     };
-    // If the gaussians exceed their capacity, no entries were counted, so estimate
-    // their number: most scenes have one or two entries per gaussian.
+    // If the gaussians exceed their capacity, their entries were not counted. Estimate
+    // one entry per gaussian, because most scenes have one or two.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
     grow(capacity_.items, counters.items);
     grow(capacity_.records, counters.gaussians);

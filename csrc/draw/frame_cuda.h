@@ -157,7 +157,7 @@ class Frame {
     DeviceBuffer<float> normals_;
     DeviceBuffer<int32_t> instances_;
     DeviceBuffer<ItemTiles> item_tiles_;
-    // The large buffers.
+    // Large buffers, which are enlarged together.
     GrowingBuffer<float> records_;
     DeviceBuffer<RecordBox> boxes_;  // only used with a tape
     GrowingBuffer<LargeRecord> large_;

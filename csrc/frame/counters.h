@@ -23,8 +23,8 @@ struct FrameCounters {
     // Large records or parts of them, including the padding of batches.
     unsigned long long large;
     unsigned long long spread;  // number of list entries that need scratch memory
-    unsigned long long slots;   // number of gradient slots, in a frame with a tape
-    CutChoice choice;           // valid if the cut has a budget
+    unsigned long long slots;   // number of gradient slots, for a frame with a tape
+    CutChoice choice;           // only valid if the cut has a budget
 };
 
 // The counts of one image, for frames that report counts of images.

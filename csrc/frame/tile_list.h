@@ -193,7 +193,8 @@ struct FrameLists {
     uint32_t num_marked = 0;
 };
 
-// Records over more tiles than this are large: they are processed by rows of tiles.
+// Records that touch more tiles than this are called large. They are processed by rows
+// of tiles.
 constexpr unsigned kFewTiles = 4;
 
 // The tiles that a record touches: the first tile, the number of columns, and the
@@ -201,8 +202,8 @@ constexpr unsigned kFewTiles = 4;
 struct TileBox {
     uint32_t left, top, columns, count;
 
-    // Return the offset of tile k from the first tile. Precondition: at most kFewTiles
-    // tiles. A box with more than two columns then has only one row.
+    // Return the offset of tile k from the first tile. Precondition: there are at most
+    // kFewTiles tiles. A box with more than two columns then has only one row.
     V3DG_HD uint32_t columns_to(uint32_t k) const {
         return columns > 2 ? k : columns == 2 ? k & 1 : 0;
     }
@@ -218,16 +219,16 @@ V3DG_HD inline TileBox tile_box(const EntryBox& b) {
     return {left, top, columns, columns * rows};
 }
 
-// A record over few tiles, packed for the scatter kernel: the depth, the first tile in
-// the picture, the first block relative to that tile, and the numbers of further block
-// columns and rows.
+// A record that touches few tiles, packed for the scatter kernel. It has the depth, the
+// first tile in the picture, the first block relative to that tile, and the numbers of
+// additional block columns and rows.
 using FewTiles = unsigned long long;
-// Marks a large record. No small record has this value: its box would cover 5 x 5
-// tiles.
+// Marks a large record. No small record has this value, because its box would cover 5 x
+// 5 tiles.
 constexpr FewTiles kManyTiles = ~FewTiles(0);
 constexpr int kFewBoxBits = 14, kFewTileBits = 22;
-// The largest index of a tile that FewTiles holds. A record whose first tile has a
-// larger index is treated as large.
+// The largest index of a tile that FewTiles can hold. If a record's first tile has a
+// larger index, the record is treated as large.
 constexpr uint32_t kMostFewTile = (1u << kFewTileBits) - 1;
 
 V3DG_HD inline FewTiles few_tiles(uint32_t depth, uint32_t tile, const EntryBox& b) {
@@ -246,7 +247,7 @@ V3DG_HD inline EntryBox box_of(FewTiles f) {
     return {x0, x0 + (box >> 4 & 31), y0, y0 + (box & 15)};
 }
 
-// A large record: a record over more than kFewTiles tiles, or some rows of tiles of
+// A large record, which touches more than kFewTiles tiles, or some rows of tiles of
 // such a record. Large records are stored in batches of kLargeAtOnce. The records of a
 // batch come from one item, and the end of a batch may be padding. A batch covers at
 // most kMostLargeTiles tiles, or one row of tiles of each record.

@@ -50,9 +50,9 @@ struct ListWindow {
     uint32_t end;  // index after the last entry of the window
 };
 
-// The state of a tile's pixels, in areas of 8 x 4 pixels. In areas of odd columns, the
-// upper and lower halves are exchanged, so that the pixels of half a warp are in
-// different banks. This holds for one and for two pixels per lane.
+// The state of a tile's pixels, stored in areas of 8 x 4 pixels. In areas of odd
+// columns, the upper and lower halves are exchanged, so that the pixels of half a warp
+// are in different banks, both with one and with two pixels per lane.
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
@@ -99,8 +99,8 @@ struct BlendShared {
     uint32_t crowded;          // number of sampled entries in crowded buckets
     float stops_behind;        // StopsBehind::transmittance, or kStopsBefore
     SpreadLevel level[kMostSpreadLevels];
-    // Sums of weight * depth, in the order of TilePixels. This member must be the last
-    // one: frames without depth do not allocate it.
+    // Sums of weight * depth, in the order of TilePixels. This must be the last member,
+    // because frames without depth do not allocate it.
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared<256>) < 1 << 15,
@@ -228,8 +228,9 @@ __device__ uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
     return before;
 }
 
-// The steps of sorting a piece by buckets. The counter of a bucket is 0 first. Then it
-// is the first index of the bucket, and in the end the first index of the next bucket.
+// The steps of sorting a piece with buckets. Initially, the counter of each bucket is
+// 0. It then becomes the index of the bucket's first entry, and finally the index of
+// the next bucket's first entry.
 template <class SomeBuckets, class Shared>
 __device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
                               Shared& s) {
@@ -252,7 +253,7 @@ __device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket,
     __syncthreads();
 }
 
-// Sorts the piece: sets s.sorted.
+// Sorts the piece, and writes the result to s.sorted.
 template <class Shared>
 __device__ void sort_piece(const RecordPlanes& records, uint32_t count, Shared& s) {
     constexpr int kThreads = Shared::kThreads;
@@ -276,8 +277,8 @@ __device__ void sort_piece(const RecordPlanes& records, uint32_t count, Shared& 
     }
     if (few) return;
     count_buckets(buckets, s.bucket, count, s);
-    // Each entry is compared with every other entry of its bucket. A sample of entries
-    // shows whether most buckets are crowded, so that finer buckets are faster.
+    // Each entry is compared with every other entry of its bucket, which is slow in
+    // crowded buckets. A sample of entries estimates whether finer buckets are faster.
     const bool is_crowded =
         threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);

@@ -56,14 +56,14 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
-// The number of touched blocks from which on the exact test pays off. A block is drawn
-// fastest if one vector covers it.
+// From this number of touched blocks on, the exact test of the ellipse saves time.
+// Blocks are cheapest to draw if one vector covers a whole block.
 constexpr int kFewBlocks = kLanes<float> == kBlockPixels ? 9 : 5;
 
 // Returns the subset of `blocks` that the ellipse reaches. For each row of blocks, it
 // computes the extent of the ellipse in x over the rows of pixel centres, with the
-// margin of row_extent(). Values are rounded by truncation, because every instruction
-// set has a single instruction for it.
+// margin of row_extent(). Values are truncated, because every instruction set can do
+// this in one instruction.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;

@@ -128,8 +128,8 @@ struct TileBinInput {
     Capacity capacity;
     const LargeRecord* large;
     TileCounts counts;
-    // The function sets counters->entries. Large records beyond the capacity are not
-    // counted in it.
+    // This function sets counters->entries. That count does not include large records
+    // beyond the capacity.
     FrameCounters* counters;
 };
 

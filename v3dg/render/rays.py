@@ -94,10 +94,10 @@ def cast_rays(
     bundle, or through all gaussians of an asset.
 
     Args:
-        viewmats: (B, 4, 4) world to sensor: doubles in host memory, or a tensor of
-            float32 or float64 on the device.
-        returns: The least weight of a return, and the gap behind it; None for colour
-            and range.
+        viewmats: (B, 4, 4) from world to sensor, as doubles in host memory, or as a
+            float32 or float64 tensor on the device.
+        returns: The minimum weight of a return, and the gap after it; None to compute
+            colour and range instead.
 
     Raises:
         ValueError: The cut has a budget, or an asset is drawn with a cut.
