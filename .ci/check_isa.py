@@ -1,4 +1,4 @@
-"""Check that the compiled module runs on every x86-64 processor.
+"""Checks that the compiled module runs on every x86-64 processor.
 
 Some sources are compiled once per instruction set, and every object file contains
 copies of the inline functions that it uses. The linker keeps one of the copies. If it

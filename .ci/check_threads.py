@@ -68,7 +68,8 @@ def sources_with_mutexes(csrc: Path) -> list[str]:
 
 
 def cuda_headers() -> Path | None:
-    """Returns the folder with the CUDA runtime's header, which is beside nvcc."""
+    """Returns the folder with the CUDA runtime's header, which is found from the path
+    of nvcc."""
     nvcc = shutil.which("nvcc")
     folders = [Path("/usr/local/cuda/include")]
     if nvcc is not None:
@@ -85,8 +86,8 @@ def include_options(csrc: Path) -> list[str]:
         options += ["-isystem", sysconfig.get_path("include")]
     if (cuda := cuda_headers()) is not None:
         options += ["-isystem", str(cuda)]
-    # Clang has a header of OpenMP only with libomp-dev. Otherwise that of GCC suffices,
-    # without an attribute with an argument that Clang does not know.
+    # Clang has a header of OpenMP only if libomp-dev is installed. Otherwise GCC's
+    # header is used, without an attribute whose argument Clang does not support.
     if compiler := shutil.which("g++"):
         command = [compiler, "-print-file-name=include"]
         folder = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,5 +1,5 @@
-"""Prints the durations of tests as Markdown: of the slowest tests, of folders, and the
-share of tests that end within five minutes.
+"""Prints the durations of tests as Markdown: those of the slowest tests and of folders,
+and the fraction of tests that end within five minutes.
 
     python .ci/durations.py build/ci/tests.xml
 
@@ -27,7 +27,8 @@ def durations_of(path: Path) -> dict[str, float]:
 
 
 def folder_of(name: str) -> str:
-    """`tests/unit/core` of `tests.unit.core.test_select::test_x`."""
+    """Return the folder of a test module, such as `tests/unit/core` for
+    `tests.unit.core.test_select::test_x`."""
     module = name.partition("::")[0].split(".")
     return "/".join(part for part in module if not part.startswith(("test_", "Test")))
 

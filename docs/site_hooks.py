@@ -51,7 +51,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Adapt links to the paths of the site, and insert the options of commands."""
     if page.file.src_uri == "command_line.md":
         markdown = markdown.replace("<!-- commands -->", "\n\n".join(map(command_text, COMMANDS)))
-    home = "../" * page.file.src_uri.count("/")  # from the page to the top of the site
+    # relative path from the page to the root of the site
+    home = "../" * page.file.src_uri.count("/")
     for source, target in PAGES.items():
         markdown = markdown.replace(f"]({home}../{source})", f"]({home}{target})")
     return markdown.replace(f"]({home}../benchmarks/results/", f"]({home}benchmarks/results/")
@@ -67,8 +68,8 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 def on_page_context(
     context: dict[str, Any], page: Page, config: MkDocsConfig, nav: Navigation
 ) -> dict[str, Any]:
-    """Write the text of a page beside its HTML. With the home page, write llms.txt
-    (llmstxt.org), because all pages have been read by then."""
+    """Write the text of a page to the folder of its HTML. When the home page is
+    written, all pages have been read, so write llms.txt (llmstxt.org) then."""
     site = Path(config.site_dir)
     text = site / page.file.src_uri
     text.parent.mkdir(parents=True, exist_ok=True)
@@ -124,11 +125,11 @@ def notebook_text(notebook: dict[str, Any]) -> str:
 
 
 def command_text(name: str) -> str:
-    """A section on one command: what it does, and tables of its arguments and
+    """Return a section on one command: its description, and tables of its arguments and
     options."""
     with warnings.catch_warnings():
-        # tyro will drop it, and nothing else tells what a parser takes; the extra
-        # `docs` pins its version.
+        # tyro will remove this function, but nothing else lists the options of a
+        # parser. The extra `docs` pins the version of tyro.
         warnings.simplefilter("ignore", DeprecationWarning)
         parser: argparse.ArgumentParser = tyro.extras.get_parser(
             COMMANDS[name][0], prog=f"v3dg {name}", config=(tyro.conf.FlagCreatePairsOff,)
@@ -148,7 +149,8 @@ def command_text(name: str) -> str:
 
 
 def _spelling(action: argparse.Action) -> str:
-    """An option with its short form and its value, or an argument's name."""
+    """Return an option with its short form and its value, or the name of an
+    argument."""
     value = action.metavar if isinstance(action.metavar, str) else ""
     names = ", ".join(f"`{option}`" for option in sorted(action.option_strings, key=len))
     choices = re.fullmatch(r"\{(.*)\}", value)

@@ -1,4 +1,4 @@
-"""Drop the gaussians of a captured scene that cannot be seen from where people are,
+"""Drops the gaussians of a captured scene that cannot be seen from where people are,
 before its levels are built.
 
 The example needs torch:
@@ -23,8 +23,8 @@ import v3dg
 
 @dataclass
 class Config:
-    """Rank gaussians by how much of them cameras see, and write the most visible
-    ones."""
+    """Rank gaussians by how visible they are for the cameras, and write the most
+    visible ones."""
 
     asset: tyro.conf.Positional[Path]
     """Asset to read, in any format that v3dg reads."""

@@ -1,4 +1,4 @@
-"""Let donuts fall into a pile, and film them. The instances move, and a new cut is
+"""Lets donuts fall into a pile, and films them. The instances move, and a new cut is
 selected in every frame.
 
 The example needs the extra `video`:
@@ -29,7 +29,7 @@ from benchmarks.worlds.procedural import make_donut
 from v3dg.video import write_video
 
 FPS = 30
-STEPS_PER_FRAME = 2  # steps of the physics, of 1/60 s each
+STEPS_PER_FRAME = 2  # number of steps of the physics, each 1/60 s long
 BACKGROUND = (0.80, 0.86, 0.90)
 
 

@@ -1,11 +1,11 @@
-"""Draw a simulated arm of MuJoCo among gaussians: it pushes a donut of gaussians, which
-is a body of the simulation.
+"""Draws a simulated arm of MuJoCo among gaussians. The arm pushes a donut of gaussians,
+which is a body of the simulation.
 
     pip install '.[mujoco]'
     MUJOCO_GL=egl python examples/mujoco_among_splats.py --output arm.png
 
-MUJOCO_GL=osmesa draws without a GPU and without a display, too. Further assets stand
-behind the arm.
+MUJOCO_GL=osmesa also draws without a GPU and without a display. More assets can be
+placed behind the arm.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from v3dg.pictures import write_picture
 from v3dg.rotations import turn_between
 from v3dg.simulators.mujoco import SplatRenderer
 
-RADIUS = 0.12  # of the donut
+RADIUS = 0.12  # radius of the donut
 MODEL = f"""
 <mujoco>
   <option timestep="0.002"/>
@@ -76,7 +76,7 @@ MODEL = f"""
   </actuator>
 </mujoco>
 """
-START = (0.7, 1.17, 1.05, 0.9)  # rad
+START = (0.7, 1.17, 1.05, 0.9)  # initial angles of the joints in radians
 END = (-0.2, 1.17, 1.05, 0.9)
 
 
@@ -85,9 +85,9 @@ class Config:
     """Draw a simulated arm of MuJoCo among gaussians."""
 
     output: Path = Path("arm.png")
-    """Picture to write: the view of the room, and below it that of the wrist."""
+    """Picture to write, with the view of the room above the view of the wrist."""
     assets: tuple[Path, ...] = ()
-    """Further assets, which stand behind the arm."""
+    """More assets, which are placed behind the arm."""
     up: Axis = "z"
     """Axis that is up in these assets."""
     scale: float = 0.25
@@ -95,7 +95,7 @@ class Config:
     gaussians: int = 30_000
     """Number of gaussians of the donut."""
     seconds: float = 2.0
-    """Time that is simulated."""
+    """Duration of the simulation in seconds."""
     size: tuple[int, int] = (960, 540)
     """Width and height of each picture in px."""
     device: str = "cpu"

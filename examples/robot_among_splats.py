@@ -1,9 +1,9 @@
-"""Draw a robot of triangles among gaussians: a small z-buffer renderer draws the robot,
-and v3dg puts it among the gaussians, with edges and ids.
+"""Draws a robot of triangles among gaussians. A small z-buffer renderer draws the
+robot, and v3dg combines it with the gaussians, with antialiased edges and ids.
 
     python examples/robot_among_splats.py --output robot.png
 
-The picture beside it, robot_channels.png, shows depth, normals, instances and labels.
+A second picture, robot_channels.png, shows depth, normals, instances and labels.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from v3dg.rotations import rotation_from_quaternion, turn_between
 Floats = npt.NDArray[np.float64]
 Light = Literal["display", "linear"]
 
-SAMPLES = 4  # z-buffer samples of a pixel along each axis
+SAMPLES = 4  # number of z-buffer samples of a pixel along each axis
 SUN = np.array([0.4, -0.5, 0.77])  # direction to the light
 FLOOR_LABEL = 1
 ROBOT_LABEL = 2
 FOOD_LABEL = 3
-FIRST_PART = 1000  # ids of the robot's parts, beyond those of the scene's instances
+# first id of the robot's parts, larger than the ids of the scene's instances
+FIRST_PART = 1000
 CHANNELS: tuple[Channel, ...] = ("depth", "median_depth", "normal", "instance", "label", "weight")
 
 
@@ -43,7 +44,7 @@ class Config:
     output: Path = Path("robot.png")
     """Picture to write."""
     assets: tuple[Path, ...] = ()
-    """Further assets, which stand behind the robot."""
+    """More assets, which are placed behind the robot."""
     up: Axis = "z"
     """Axis that is up in these assets."""
     gaussians: int = 30_000
@@ -53,7 +54,7 @@ class Config:
     size: tuple[int, int] = (960, 640)
     """Width and height of the picture in px."""
     light: Light = "linear"
-    """Light in which robot and gaussians are mixed."""
+    """Colour space in which robot and gaussians are mixed."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Part:
     """Triangles (T, 3, 3) in the world, their colour and their label."""
 
     triangles: Floats
-    albedo: tuple[float, float, float]  # linear light
+    albedo: tuple[float, float, float]  # in linear light
     label: int = ROBOT_LABEL
 
 
@@ -104,7 +105,7 @@ def ball(center: Floats, radius: float) -> Floats:
 
 
 def robot() -> list[Part]:
-    """Return an arm on a base. Its forearm goes through a donut."""
+    """Return the parts of an arm on a base. Its forearm passes through a donut."""
     joints = np.array([[0, 0, 0.9], [0.1, 0, 2.3], [1.5, -0.1, 1.55], [2.15, -0.15, 1.2]])
     steel = (0.55, 0.57, 0.6)
     orange = (0.85, 0.23, 0.03)
@@ -130,9 +131,9 @@ def robot() -> list[Part]:
 
 @dataclass
 class Samples:
-    """A z-buffer, SAMPLES x SAMPLES samples a pixel."""
+    """A z-buffer with SAMPLES x SAMPLES samples per pixel."""
 
-    depth: Floats  # (h, w); infinite where nothing is
+    depth: Floats  # (h, w); infinite where nothing is drawn
     color: Floats  # (h, w, 3) linear
     normal: Floats  # (h, w, 3) in the axes of the camera
     part: npt.NDArray[np.int32]  # (h, w)
@@ -196,7 +197,10 @@ def _draw_triangle(
 def _layer_of(
     samples: Samples, parts: list[Part], camera: v3dg.Camera, light: Light
 ) -> v3dg.MeshLayer:
-    """Average the samples of each pixel. Its ids are those of its nearest sample."""
+    """Average the samples of each pixel.
+
+    The ids of a pixel are those of its nearest sample.
+    """
 
     def of_pixels(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         shape = (camera.height, SAMPLES, camera.width, SAMPLES, *values.shape[2:])
@@ -227,14 +231,15 @@ def _layer_of(
 
 
 def make_scene(config: Config) -> v3dg.Scene:
-    """Return a scene of donuts on the floor and one on the forearm. Further assets are
-    behind the robot."""
+    """Return a scene of donuts on the floor and one donut on the forearm. More assets
+    are behind the robot."""
     build = v3dg.BuildConfig(steps=config.steps)
     donut = v3dg.build_bundle(make_donut(config.gaussians), config=build)
     scene = v3dg.Scene()
     axis = np.array([1.4, -0.1, -0.75])
     axis /= np.linalg.norm(axis)
-    half = np.array([0.0, 0, 1]) + axis  # turns z to the axis
+    # half a turn about this vector maps z to the axis
+    half = np.array([0.0, 0, 1]) + axis
     on_arm = (half[2], -half[1], half[0], 0.0)
     flat = (1.0, 0, 0, 0)
     scene.add(

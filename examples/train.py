@@ -1,4 +1,4 @@
-"""Train gaussians on pictures with the arguments of gsplat's `rasterization`, on a CPU
+"""Trains gaussians on pictures with the arguments of gsplat's `rasterization`, on a CPU
 or a GPU. v3dg draws the pictures and computes the gradients.
 
 The pictures of this example show a generated donut; in practice they are photographs.

@@ -1,5 +1,5 @@
-"""Train gaussians on photographs with gsplat's DefaultStrategy. v3dg draws the pictures
-and computes the gradients.
+"""Trains gaussians on photographs with gsplat's DefaultStrategy. v3dg draws the
+pictures and computes the gradients.
 
 The input is a folder in the layout of COLMAP's `image_undistorter`, with photographs in
 `images/` and a model in `sparse/` or `sparse/0`; or a folder with a `transforms.json`

@@ -1,12 +1,12 @@
-"""Train a policy that drives to a red donut and avoids a blue one, from pixels: many
-environments in one scene, drawn by one call a step, and PPO in plain torch.
+"""Trains a policy that drives to a red donut and avoids a blue one, from pixels. One
+call per step draws many environments in one scene. The algorithm is PPO in plain torch.
 
     pip install '.[gymnasium]'
     python examples/train_policy.py --device cuda
 
-It prints the mean return of an episode of random actions, and that of the policy as it
-learns. It also writes what one of the robots sees in an episode, as a strip of
-pictures.
+The example prints the mean return of an episode with random actions, and that of the
+policy while it learns. It also writes the pictures that one robot sees in an episode,
+as a strip.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from v3dg.donut import make_donut
 from v3dg.pictures import write_picture
 from v3dg.simulators.gymnasium import PictureVectorEnv
 
-TURN = math.radians(18)  # of a step
-STRIDE = 0.3  # of a step, in world units
+TURN = math.radians(18)  # rotation of a step
+STRIDE = 0.3  # distance of a step in world units
 REACH = 0.8  # distance at which a donut is reached
 EYE_HEIGHT = 0.5
 GOAL_TINT = (1.0, 0.25, 0.2)
@@ -48,11 +48,11 @@ class Config:
     gaussians: int = 20_000
     """Number of gaussians of a donut."""
     steps: int = 16
-    """Steps in every environment between two updates."""
+    """Number of steps in every environment between two updates."""
     updates: int = 60
     """Number of updates of the policy."""
     max_steps: int = 24
-    """Longest episode in steps."""
+    """Maximum number of steps of an episode."""
     seed: int = 0
     device: str = "auto"
     """Device that draws and trains: auto, cpu or cuda."""
@@ -61,10 +61,10 @@ class Config:
 
 
 class DriveToDonut(PictureVectorEnv):
-    """A robot with a camera turns and drives; a red and a blue donut stand on the
-    ground. The reward of a step is the decrease of the distance to the red one.
-    Reaching that adds 2, and reaching the blue one subtracts 2. Either ends the
-    episode."""
+    """An environment in which a robot with a camera turns and drives, and a red and a
+    blue donut are on the ground. The reward of a step is the decrease of the distance
+    to the red donut. Reaching this donut adds 2, and reaching the blue one subtracts 2.
+    Either ends the episode."""
 
     def __init__(self, donut: v3dg.Bundle, config: Config) -> None:
         scene = v3dg.Scene()
@@ -72,7 +72,7 @@ class DriveToDonut(PictureVectorEnv):
         environments = np.arange(count)
         for tint in (GOAL_TINT, TRAP_TINT):
             scene.add(donut, np.zeros((count, 3)), environment=environments, tint=tint)
-        focal = 0.5 * config.size  # a field of view of 90 degrees
+        focal = 0.5 * config.size  # gives a field of view of 90 degrees
         middle = 0.5 * config.size
         super().__init__(
             scene,
@@ -87,7 +87,8 @@ class DriveToDonut(PictureVectorEnv):
         )
         self._positions = torch.zeros(count, 2, device=self.device)
         self._headings = torch.zeros(count, device=self.device)
-        self._donuts = torch.zeros(2, count, 3, device=self.device)  # goals, then traps
+        # first the goals, then the traps
+        self._donuts = torch.zeros(2, count, 3, device=self.device)
 
     def _uniform(self, low: float, high: float) -> torch.Tensor:
         numbers = torch.rand(self.num_envs, generator=self.random, device=self.device)
@@ -137,7 +138,8 @@ class DriveToDonut(PictureVectorEnv):
 
 
 class Policy(nn.Module):
-    """Logits of actions, and the value of a state, from a picture."""
+    """A network that computes logits of actions and the value of a state from a
+    picture."""
 
     def __init__(self, num_actions: int, size: int) -> None:
         super().__init__()
@@ -169,7 +171,7 @@ class Rollout(NamedTuple):
     log_probs: torch.Tensor
     advantages: torch.Tensor
     returns: torch.Tensor
-    is_used: torch.Tensor  # False where an action was ignored, because an episode began
+    is_used: torch.Tensor  # False where an action was ignored because an episode began
 
 
 @torch.no_grad()
@@ -211,7 +213,10 @@ def advantages_of(
     discount: float = 0.97,
     trace: float = 0.95,
 ) -> torch.Tensor:
-    """Return (T, N) advantages. A step that only starts an episode passes none back."""
+    """Return advantages (T, N).
+
+    A step that only starts an episode passes no advantage to the step before it.
+    """
     advantages = torch.zeros_like(values)
     later = torch.zeros_like(next_values)
     for step in reversed(range(len(values))):
@@ -266,7 +271,8 @@ def mean_return(
 
 @torch.no_grad()
 def film(env: DriveToDonut, policy: Policy, seed: int) -> torch.Tensor:
-    """Return what the first robot sees until its episode ends, side by side."""
+    """Return the pictures that the first robot sees until its episode ends, side by
+    side."""
     pictures, _ = env.reset(seed=seed)
     strip = []
     for _ in range(12):
@@ -278,7 +284,7 @@ def film(env: DriveToDonut, policy: Policy, seed: int) -> torch.Tensor:
 
 
 def main(config: Config) -> tuple[float, float]:
-    """Train a policy; return the mean return of random actions and of the policy."""
+    """Train a policy; return the mean returns of random actions and of the policy."""
     torch.manual_seed(config.seed)
     build = v3dg.BuildConfig(steps=0)
     donut = v3dg.build_bundle(make_donut(config.gaussians), config=build, progress=False)

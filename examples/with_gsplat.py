@@ -1,5 +1,5 @@
-"""Select the gaussians for a view with v3dg, and draw them with gsplat. The gaussians
-of a selection can be drawn by any rasterizer.
+"""Selects the gaussians for a view with v3dg, and draws them with gsplat. Any
+rasterizer can draw the gaussians of a selection.
 
 The example needs a GPU:
 

@@ -10,7 +10,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Bound:
-    """For each element: |got - expected| <= absolute + relative * |expected|."""
+    """A bound for each element: |got - expected| <= absolute + relative *
+    |expected|."""
 
     relative: float
     absolute: float
@@ -19,12 +20,12 @@ class Bound:
 
 @dataclass(frozen=True)
 class PictureBound:
-    """Colour and alpha: `absolute` at every pixel, `mean` over all. Depth:
-    `relative_depth` at every pixel.
+    """Bounds for pictures. Colour and alpha may differ by `absolute` at every pixel and
+    by `mean` on average; depth may differ by `relative_depth` at every pixel.
 
-    A pixel where an alpha lies within the relative distance `band` of 1/255, or a
-    transmittance of 1e-4, may be decided either way. Such pixels are held to `flip`; at
-    most `share` of all pixels may need that.
+    If an alpha is within the relative distance `band` of 1/255, or a transmittance
+    within that of 1e-4, rounding decides whether the gaussian is drawn. Such pixels may
+    differ by `flip`, but at most the fraction `share` of all pixels.
     """
 
     absolute: float

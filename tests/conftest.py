@@ -33,7 +33,8 @@ settings.load_profile("v3dg")
 
 @pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
-    """Each device in turn. devices.py has functions that copy arrays to it and back."""
+    """The device, which is each device in turn. devices.py has functions that copy
+    arrays to it and back."""
     return request.param
 
 

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # A NumPy array on the host, or a torch tensor on a CUDA device. The type cannot be
-# narrower: torch may not be installed, so its tensor has no type here, and the device
-# that decides between the two is not part of any type.
+# narrower, because torch may not be installed, and the device is not part of a type.
 Array: TypeAlias = Any
 
 Float32: TypeAlias = NDArray[np.float32]
@@ -58,7 +57,8 @@ class Camera:
     def height(self) -> int: ...
 
 class Eyes:
-    """Two cameras that look the same way and share a cut; or a single camera."""
+    """Two cameras that look in the same direction and share a cut; or a single
+    camera."""
 
     @overload
     def __init__(self, camera: Camera) -> None: ...
@@ -66,7 +66,7 @@ class Eyes:
     def __init__(self, left: Camera, right: Camera) -> None: ...
 
 class Rule:
-    """The rule of a selection: which clusters it chooses."""
+    """The rule of a selection, which determines the chosen clusters."""
 
     def __init__(
         self,
@@ -339,7 +339,7 @@ class RasterizedViews:
     def tape(self) -> ViewsTape | None: ...
 
 class Gradients:
-    """Gradients with respect to the inputs of a picture, or of several.
+    """Gradients with respect to the inputs of one or several pictures.
 
     Attributes:
         poses: (V, 3, 4) gradients with respect to the world-to-camera matrices of V
@@ -374,7 +374,7 @@ class Ellipses:
     Attributes:
         centers: (N, 2) in px.
         depths: (N,) in world units.
-        conics: (N, 3) inverse covariances, px⁻².
+        conics: (N, 3) inverse covariances in px⁻².
         opacities: (N,) after compensation for the filter.
         radii: (N, 2) int32, in px.
     """
@@ -391,9 +391,9 @@ class Ellipses:
     def radii(self) -> Array: ...
 
 class RaySensor:
-    """A sensor without a pose: rays of ascending azimuths and elevations. `rows` and
-    `columns` are their places in the picture. The sensor has x forward, y left and z
-    up."""
+    """A sensor without a pose: rays with ascending azimuths and elevations. `rows` and
+    `columns` are the rays' positions in the picture. The sensor's axes are x forward, y
+    left and z up."""
 
     def __init__(
         self,
@@ -485,8 +485,8 @@ def rasterize_views(
     plain_colors: bool = ...,
 ) -> RasterizedViews: ...
 
-# The gradients are sums over the cameras, apart from centres, backgrounds, poses, and
-# those that are requested for each view.
+# The gradients are sums over the cameras. Exceptions are centres, backgrounds, poses,
+# and gradients that are requested for each view.
 def rasterize_views_backward(
     tape: ViewsTape,
     d_color: Array | None,
@@ -500,7 +500,7 @@ def rasterize_views_backward(
     sh_for_each_view: bool = ...,
 ) -> Gradients: ...
 
-# Returns (G,) the factors by which the balls of level 1 must grow, so that groups are
+# Returns the factors (G,) by which the balls of level 1 must grow, so that groups are
 # selected at a suitable size.
 def first_selected(
     leaves: Rows,
@@ -536,8 +536,8 @@ def ellipses_of_views(
 ) -> tuple[Array, Array, Array, Array, Array]: ...
 
 class Stop:
-    """A flag with which any thread can stop a picture in progress, which then stays
-    unfinished."""
+    """A flag with which any thread can stop a picture in progress. The picture then
+    stays unfinished."""
 
     def request(self) -> None: ...
     @property
@@ -592,8 +592,8 @@ class Mesh:
 
     Args:
         color: (..., 3).
-        depth, coverage: (...). On a CUDA device, `coverage` may be None: 1 where the
-            depth is positive and finite.
+        depth, coverage: (...). On a CUDA device, `coverage` may be None, which means 1
+            where the depth is positive and finite.
         normal: (..., 3) of any length, or None.
         instance, label: (...), or None.
         is_linear: Whether colours are in linear light.
@@ -619,7 +619,7 @@ class Sensor:
         """Return the sensor with the meshes of one of two eyes."""
 
 class Picture:
-    """The planes of a picture."""
+    """The arrays of a picture."""
 
     @property
     def color(self) -> Array: ...
@@ -764,7 +764,7 @@ class PagePool:
     def read_one(self) -> bool: ...
 
 class Palette:
-    """Colours for a bundle's clusters, in which gaussians can be drawn."""
+    """Colours for the clusters of a bundle, with which gaussians can be drawn."""
 
     def __init__(self, table: ClusterTable, sh: NDArray[np.float32], device: int) -> None: ...
 
@@ -775,8 +775,9 @@ class Shade:
     whether depth is drawn.
 
     Args:
-        min_transmittance: 0 or more; or `stops_before`, as in `v3dg.rasterize`; or
-            `stops_by_cut`, by the tolerance of the cut.
+        min_transmittance: 0 or more, or one of two constants: `stops_before` stops
+            pixels as `v3dg.rasterize` does, and `stops_by_cut` uses the tolerance of
+            the cut.
     """
 
     def __init__(
@@ -794,8 +795,8 @@ class Cameras:
 
     Args:
         viewmats: (B, 4, 4).
-        K: (B, 3, 3), or (3, 3) for all.
-        environments: (B,), or None where each camera sees all instances.
+        K: (B, 3, 3), or (3, 3) for all cameras.
+        environments: (B,), or None if each camera sees all instances.
         lenses: The cameras on the CPU if some have lens distortion, or None.
     """
 
@@ -815,7 +816,7 @@ class Cameras:
 def fault_of_cameras(viewmats: Float64, K: Float64) -> tuple[int, str] | None: ...
 
 class BatchPlanes:
-    """The planes of a batch; keeps the arrays.
+    """The arrays of a batch, which the object keeps alive.
 
     Args:
         color: (B, H, W, 3 or 4).
@@ -911,7 +912,7 @@ class FrameRequest:
             metrics.
         cut: A cut that is drawn instead of a selected one.
         look: The colours that the picture shows; None for the frame's own colours.
-        sensor: Channels beside colour, and meshes; None for neither.
+        sensor: Channels besides colour, and meshes; None for neither.
     """
 
     def __init__(
@@ -1048,7 +1049,7 @@ def fit_level(
 
 # The comparison of cuts with the asset. `refine_cuts` overwrites `gaussians`.
 class CutComparison:
-    """The number of windows in a step of a refinement, and of cuts for each view, and
+    """The number of windows per step of a refinement, the number of cuts per view, and
     the weight of the mean differences of windows."""
 
     def __init__(

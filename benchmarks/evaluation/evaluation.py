@@ -33,7 +33,7 @@ from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-FOV_X = math.pi / 4  # radians; the horizontal field of view in the paper
+FOV_X = math.pi / 4  # horizontal field of view in the paper, in radians
 _MOST_PICTURE_PX = 1400, 2000
 PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
 
@@ -41,8 +41,8 @@ PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
 def paper_tolerance(tau_px2: float) -> float:
     """Convert a tolerance of the paper to a tolerance of v3dg.
 
-    The paper measures px² of a group that is drawn as one cluster, v3dg px² per
-    gaussian.
+    The paper measures a group that is drawn as one cluster in px². v3dg measures px²
+    per gaussian.
     """
     return tau_px2 / PAPER_CLUSTER_SIZE
 
@@ -74,8 +74,8 @@ def views_of(cameras: Iterable[Camera]) -> list[View]:
         x, y, z = camera.position
         distance = math.sqrt(x * x + y * y + z * z)
         azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.asin(z / distance))
-        # Files round angles: a value just below 0 must not become a separate direction
-        # at 360 degrees.
+        # Angles in files are rounded. A value just below 0 must not become a separate
+        # direction at 360 degrees.
         views.append(View(round(azimuth, 2) % 360, elevation, distance, camera))
     return views
 
@@ -123,7 +123,7 @@ class Built:
 @dataclass(frozen=True)
 class Shot:
     """The measurement of one view: picture, statistics and time. The picture is drawn
-    before and after the timed runs, with equal bytes."""
+    before and after the timed runs, and both must have the same bytes."""
 
     view: View
     picture: Picture
@@ -172,7 +172,7 @@ class Evaluation:
 
     def warm_up(self) -> None:
         """Load everything that the first build and the first picture need, so that no
-        part's time includes loading."""
+        measured time includes it."""
         tiny = make_asset(1000)
         bundle = build_bundle(
             tiny, config=BuildConfig(steps=2), progress=False, device=self._device, quality="draft"
@@ -269,8 +269,8 @@ class Evaluation:
         return every(line, self.settings.sweep_distances)
 
     def truth(self, index: int) -> Picture:
-        """Return the reference picture of a view of the camera sweep: supersampled,
-        with all gaussians."""
+        """Return the reference picture of a view of the camera sweep, which is
+        supersampled and shows all gaussians."""
         if index not in self._truths:
             self._truths[index] = draw_truth(
                 self.full_scene, self.camera_sweep[index].camera, self.device

@@ -75,7 +75,8 @@ def picture_error(picture: Any, truth: Any) -> dict[str, float]:
 
 
 def placed_gaussians(scene: Scene, device: str = DEVICE) -> v3dg.Gaussians:
-    """Return all instances of a scene with one bundle, at full detail, in world space.
+    """Return the gaussians of all instances of a scene with one bundle, at full detail,
+    in world space.
 
     The result has tensors, and colours of SH degree 0.
     """

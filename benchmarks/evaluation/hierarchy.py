@@ -190,7 +190,7 @@ class HierarchyScene:
         for axis in range(3):
             eye = eyes[:, axis, None]
             square = square + ((low[:, axis] - eye).clip(0) + (eye - high[:, axis]).clip(0)) ** 2
-        # Px, at the nearest point of the box.
+        # Size in px, at the nearest point of the box.
         size = focal * self._extent / (square**0.5 + 1e-30)
         fits = size <= target_px
         fits[:, self._first_leaf :] = True

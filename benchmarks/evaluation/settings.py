@@ -1,4 +1,4 @@
-"""The amount of work of each preset: all sizes in one place."""
+"""All sizes of the evaluation, for each preset."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ class Settings:
     """The sizes that define the amount of work of an evaluation.
 
     Attributes:
-        asset_gaussians: Gaussians of the main scene's asset, if it is generated.
-        instances: Instances in the main scene.
-        worlds: Instances, and gaussians per asset, of the other composed worlds.
-        world_steps: Steps of the fit of the assets of `worlds`.
+        asset_gaussians: Number of gaussians of the main scene's asset, if the asset is
+            generated.
+        instances: Number of instances in the main scene.
+        worlds: Number of instances, and of gaussians per asset, of the other composed
+            worlds.
+        world_steps: Number of steps of the fit for the assets of `worlds`.
         size: Width and height of pictures in px.
         elevations: Elevations of the cameras of "composed" in degrees; other parts use
             the middle one.
-        directions: Number of directions for "composed", of the paper's four.
+        directions: Number of directions in "composed". The paper has four.
         distances: Number of cameras per direction in "composed", and in "large".
         sweep_distances: Number of cameras in the sweep that the other parts use.
         judged_directions: Number of directions for which FLIP is computed, which takes
@@ -26,14 +28,15 @@ class Settings:
         composed_repeats: Number of timed calls per picture in "composed", which has by
             far the most views.
         steps: Numbers of steps of the fit in "fit" and "levels". These parts also
-            measure the paper's \\*0, whose gaussians are neither grown nor fitted.
-        tree_steps: Steps of the fit in "tree".
-        large_copies: Copies of the asset in the large asset.
-        large_steps: Steps of the fit of the large asset.
-        motion_frames: Frames of the zoom.
-        hierarchy_instances: Instances in the scene that is compared with a hierarchy of
-            single gaussians.
-        hard_gaussians: Gaussians of each hard asset.
+            measure the paper's variant \\*0, whose gaussians are neither grown nor
+            fitted.
+        tree_steps: Number of steps of the fit in "tree".
+        large_copies: Number of copies of the asset in the large asset.
+        large_steps: Number of steps of the fit of the large asset.
+        motion_frames: Number of frames of the zoom.
+        hierarchy_instances: Number of instances in the scene that is compared with a
+            hierarchy of single gaussians.
+        hard_gaussians: Number of gaussians of each hard asset.
         counts: Numbers of gaussians for which single operations are measured.
         close_views: Number of directions of the close views of an asset.
         close_px: Width and height of the close views in px.

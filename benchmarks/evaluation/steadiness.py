@@ -1,12 +1,13 @@
 """Steadiness of the pictures of a moving camera: camera paths, and changes between
 frames that the motion does not explain.
 
-The change of the error between consecutive frames is what an eye sees besides the
-motion: flicker, and levels that change at once. An average over the whole picture hides
-pops because they are small, so the worst tile counts. For faster motion, the difference
-is computed along the motion: the previous frame's error is warped to the current
-picture by the depth. To measure pops alone, two pictures from the same position are
-compared: one with the cut of this frame, and one with the cut of the previous frame.
+Besides the motion, an eye sees how the error changes between consecutive frames:
+flicker, and levels that change at once. Pops are small, so an average over the whole
+picture would hide them, and the worst tile is reported. For faster motion, the
+difference is computed along the motion: the previous frame's error is warped to the
+current picture by the depth. To measure pops alone, two pictures from the same position
+are compared: one with the cut of this frame, and one with the cut of the previous
+frame.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from v3dg.select import Selection, select
 
 TILE_PX = 16
 SUPERSAMPLING = 4
-# Per frame, as a fraction of the distance; so slow that only pops appear to move.
+# Motion per frame as a fraction of the distance, so slow that only pops appear to move.
 _DRIFT = 5e-4
 _ZOOM = 5e-3
-_TURN = 5e-4  # radians per frame
-_SHAKE = 2e-3  # to either side, as a fraction of the distance
+_TURN = 5e-4  # rotation per frame in radians
+_SHAKE = 2e-3  # amplitude of the shaking as a fraction of the distance
 # Frames per period of the two waves of a shaking hand. The periods differ, so that the
 # waves do not coincide.
 _WAVES = (7.3, 11.9)
@@ -40,7 +41,8 @@ _WAVES = (7.3, 11.9)
 # per step.
 _BOB, _STEP_FRAMES = 2e-3, 30.0
 _COVERED = 0.9  # minimum alpha of pixels whose depth is used
-# Fraction of the depth; a pixel whose depth differs more was hidden before.
+# Fraction of the depth. A pixel whose depth differs by more was hidden in the previous
+# frame.
 _SAME_DEPTH = 0.02
 
 # Options of `Renderer.render`, or a function that returns the options for a frame.

@@ -1,4 +1,5 @@
-"""The z-buffer of a robot of triangles in the middle of a room, by casting rays."""
+"""Draws a robot of triangles in the middle of a room into a z-buffer, by casting
+rays."""
 
 from __future__ import annotations
 
@@ -11,14 +12,14 @@ import v3dg
 
 Floats = NDArray[np.float64]
 
-_SIDES = 12  # sides of a limb
+_SIDES = 12  # number of sides of a limb
 _SUN = np.array([0.4, -0.5, 0.77])
 _COLOURS = np.array([[0.3, 0.3, 0.34], [0.9, 0.45, 0.1], [0.7, 0.7, 0.72]])
-_FIRST_PART = 1000  # ids of the robot's parts, beyond those of the scene
+_FIRST_PART = 1000  # first id of the robot's parts, larger than the ids of the scene
 
 
 def draw_robot(cameras: list[v3dg.Camera], device: str) -> v3dg.MeshLayer:
-    """Return the robot in front of cameras of one size, (B, H, W), on the device."""
+    """Return pictures (B, H, W) of the robot for cameras of one size, on the device."""
     triangles, part = _robot()
     layers = [_draw(triangles, part, camera) for camera in cameras]
     color, depth, normal, instance = (np.stack(planes) for planes in zip(*layers, strict=True))
@@ -31,7 +32,8 @@ def draw_robot(cameras: list[v3dg.Camera], device: str) -> v3dg.MeshLayer:
 
 
 def _robot() -> tuple[Floats, NDArray[np.int32]]:
-    """Return triangles (T, 3, 3) of an arm on a base, and the part of each (T,)."""
+    """Return the triangles (T, 3, 3) of an arm on a base, and the index (T,) of each
+    triangle's part."""
     joints = np.array(
         [[0, 0, 0], [0, 0, 0.5], [0.05, 0, 1.15], [0.55, 0.1, 1.3], [0.85, 0.15, 1.0]]
     )
@@ -42,7 +44,7 @@ def _robot() -> tuple[Floats, NDArray[np.int32]]:
 
 
 def _limb(start: Floats, end: Floats, radius: float) -> Floats:
-    """Return a closed cone between two points."""
+    """Return the triangles of a closed cone between two points."""
     axis = (end - start) / np.linalg.norm(end - start)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     side /= np.linalg.norm(side)
@@ -59,13 +61,16 @@ def _limb(start: Floats, end: Floats, radius: float) -> Floats:
 def _draw(
     triangles: Floats, part: NDArray[np.int32], camera: v3dg.Camera
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """Return colour, depth (0 where nothing is), normal and id of each pixel."""
+    """Return colour, depth, normal and id of each pixel.
+
+    Depth is 0 where the robot is not visible.
+    """
     view = (triangles @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).astype(np.float32)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     x = (columns - camera.cx) / camera.fx
     y = (rows - camera.cy) / camera.fy
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
-    # Moeller and Trumbore (1997), with the eye at the origin.
+    # The intersection of Möller and Trumbore (1997), with the eye at the origin.
     first = view[:, 1] - view[:, 0]
     second = view[:, 2] - view[:, 0]
     normal = np.cross(first, second)

@@ -1,4 +1,5 @@
-"""Builds of bundles: seconds, GPU memory on each device, and the error of the pictures.
+"""The cost of building bundles: seconds, GPU memory on each device, and the error of
+the pictures.
 
 The parts "default" and "paper" build the asset with the default settings and with the
 paper's. The part "split" sorts the points of many copies of the asset, and "large"
@@ -28,7 +29,7 @@ from v3dg import _core, metrics
 from v3dg.bundle import Bundle
 from v3dg.levels import BuildConfig, build_bundle
 
-# px²; at this tolerance every instance is drawn from its coarsest level
+# tolerance in px² at which every instance is drawn from its coarsest level
 _MOST_TOLERANCE = 1e4
 
 Part = Literal["default", "paper", "split", "large"]

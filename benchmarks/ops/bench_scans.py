@@ -1,8 +1,8 @@
-"""LiDAR scans and panoramas of a crowd: how many a second at poses that move, in calls
-of one pose and of several, and how far from those of the CPU.
+"""The speed of LiDAR scans and panoramas of a crowd from moving poses, with one pose or
+several per call, and their differences from those of the CPU.
 
-The crowd is that of `bench_sensors`: copies of one made asset on a floor, seen at eye
-level. The rays see all around, so that a scan has no frustum.
+The crowd is that of `bench_sensors`: copies of a generated asset on a floor, seen at
+eye level. Rays go in all directions, so a scan has no frustum.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ _NAMES = ("range", "intensity", "second_range", "second_intensity", "alpha")
 class Config:
     device: str = "cuda"
     gaussians: int = 125_000
-    """Gaussians of the asset."""
+    """Number of gaussians of the asset."""
     objects: int = 700
     distinct: int = 16
-    """Copies of the asset in memory; instances take them in turn."""
+    """Number of copies of the asset in memory; instances use them in turn."""
     rows: int = 64
     columns: int = 2048
     poses: tuple[int, ...] = (1, 4, 16, 64)
-    """Numbers of poses of a call."""
+    """Numbers of poses in one call."""
     tolerances: tuple[float, ...] = (3.0,)
     panorama: int = 2048
-    """Width of the panoramas, px."""
+    """Width of the panoramas in px."""
     compared: int = 2
-    """Scans that are compared with those of the CPU."""
+    """Number of scans that are compared with those of the CPU."""
     repeats: int = 7
     output: str | None = None
 
@@ -78,7 +78,7 @@ def lidar_of(config: Config) -> v3dg.Lidar:
 
 
 def poses_of(scene: v3dg.Scene, count: int) -> NDArray[np.float64]:
-    """Poses at eye level between the objects, on the way through the crowd."""
+    """Return poses at eye level on a path between the objects."""
     reach = np.abs(scene.positions[:, :2]).max()
     way = np.linspace(-0.9, 0.9, count)
     angle = np.linspace(0, 6, count)
@@ -136,7 +136,8 @@ def panoramas_of(scene: v3dg.Scene, config: Config) -> Row:
 
 
 def compared(scene: v3dg.Scene, lidar: v3dg.Lidar, config: Config) -> Row:
-    """Shares of rays whose values differ from the CPU's by more than a thousandth."""
+    """Return the fractions of rays whose values differ from the CPU's by more than a
+    thousandth."""
     poses = poses_of(scene, config.compared)
     on_device = v3dg.scan(scene, lidar, poses, device=config.device)
     on_cpu = v3dg.scan(scene, lidar, poses, device="cpu")

@@ -1,10 +1,10 @@
-"""Many small cameras among objects: pictures a second of a batch, and of the cameras
-one after another.
+"""Many small cameras among objects: pictures per second when all cameras are drawn in a
+batch, and when they are drawn one after another.
 
-The scenes are copies of one made asset on a floor, seen at eye level: a few objects, a
-crowd, and environments with a camera each, whose instances move in every step. On the
-CPU only the first is measured. A captured room with a robot of triangles is seen by
-fewer cameras, with every channel.
+The scenes have copies of a generated asset on a floor, seen at eye level. They are a
+few objects, a crowd, and environments that have a camera each and whose instances move
+in every step. On the CPU only the first scene is measured. A captured room with a robot
+of triangles is seen by fewer cameras, with every channel.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Row: TypeAlias = dict[str, float]
 PITCH = 3.0  # distance of neighbouring objects in units
 EYE = 0.9  # height of the cameras in units
 
-# The channels of the room: colour and these.
+# The channels that are drawn of the room, besides colour.
 SENSED: tuple[Channel, ...] = ("depth", "normal", "instance", "label")
 
 
@@ -40,20 +40,20 @@ SENSED: tuple[Channel, ...] = ("depth", "normal", "instance", "label")
 class Config:
     device: str = "cuda"
     gaussians: int = 125_000
-    """Gaussians of the asset."""
+    """Number of gaussians of the asset."""
     objects: int = 16
     crowd: int = 700
     distinct: int = 16
-    """Copies of the asset in memory; instances take them in turn."""
+    """Number of copies of the asset in memory; instances use them in turn."""
     cameras: int = 256
     sizes: tuple[int, ...] = (64, 128, 256)
     environments: int = 1024
     instances: int = 8
-    """Instances of each environment."""
+    """Number of instances in each environment."""
     room: int = 5_500_000
-    """Gaussians of the room; 0 leaves it out."""
+    """Number of gaussians of the room; 0 skips the room."""
     room_bundle: Path | None = None
-    """File of the built room; it is written if it does not exist."""
+    """File with the bundle of the room; it is written if it does not exist."""
     room_cameras: int = 64
     room_size: int = 128
     only_room: bool = False
@@ -89,7 +89,7 @@ def make_bundles(config: Config) -> list[v3dg.Bundle]:
 
 
 def floor_of(bundles: list[v3dg.Bundle], count: int) -> v3dg.Scene:
-    """Objects on a grid."""
+    """Return a scene of objects on a grid."""
     scene = v3dg.Scene()
     side = int(np.ceil(np.sqrt(count)))
     place = np.arange(count)
@@ -104,7 +104,7 @@ def floor_of(bundles: list[v3dg.Bundle], count: int) -> v3dg.Scene:
 
 
 def cameras_of(scene: v3dg.Scene, count: int, size: int) -> list[v3dg.Camera]:
-    """Cameras at eye level between the objects, which look along the floor."""
+    """Return cameras at eye level between the objects that look along the floor."""
     rng = np.random.default_rng(1)
     reach = np.abs(scene.positions[:, :2]).max() + PITCH / 2
     cameras = []
@@ -179,9 +179,9 @@ def environments_of(bundle: v3dg.Bundle, config: Config) -> Row:
 
 
 def room_of(config: Config) -> Row:
-    """A robot of triangles in a captured room: pictures a second without and with
-    channels and the robot's z-buffer, into planes of the caller, and replayed as a
-    graph on a GPU."""
+    """Measure pictures per second of a robot of triangles in a captured room: without
+    and with channels and the robot's z-buffer, with output to arrays of the caller,
+    and, on a GPU, replayed as a graph."""
     scene = v3dg.Scene()
     scene.add(room_bundle(config), label=3)
     cameras = cameras_in_room(config.room_cameras, config.room_size)
@@ -214,14 +214,15 @@ def room_of(config: Config) -> Row:
 
 
 def room_bundle(config: Config) -> v3dg.Bundle:
-    """Open the built room, or make and build it."""
+    """Open the bundle of the room; if it does not exist, make the room and build it."""
     path = config.room_bundle
     if path is not None and path.exists():
         return v3dg.Bundle.open(path)
     start = time.perf_counter()
     room = make_room(config.room)
     made = time.perf_counter()
-    # A draft, because refining millions of gaussians takes longer than the measurement.
+    # It is built as a draft, because refining millions of gaussians would take longer
+    # than the measurement.
     bundle = v3dg.build_bundle(room, progress=False, device=config.device, quality="draft")
     built = time.perf_counter()
     print(f"room made in {made - start:.1f} s, built in {built - made:.1f} s", flush=True)
@@ -231,7 +232,7 @@ def room_bundle(config: Config) -> v3dg.Bundle:
 
 
 def graph_rate(draw: Callable[[], v3dg.RenderedBatch], config: Config) -> float:
-    """Pictures a second of a captured graph."""
+    """Return the pictures per second of a captured graph."""
     import torch
 
     for _ in range(3):
@@ -245,7 +246,7 @@ def graph_rate(draw: Callable[[], v3dg.RenderedBatch], config: Config) -> float:
 
 
 def planes_of(config: Config) -> v3dg.BatchPlanes:
-    """Planes of the caller for every channel of the room."""
+    """Return arrays of the caller for every channel of the room."""
     shape = (config.room_cameras, config.room_size, config.room_size)
     return v3dg.BatchPlanes(
         empty((*shape, 3), config.device),
@@ -266,7 +267,7 @@ def empty(shape: tuple[int, ...], device: str, dtype: str = "float32") -> Array:
 
 
 def cameras_in_room(count: int, size: int) -> list[v3dg.Camera]:
-    """Cameras at the height of robots' heads, which look around the room or at the
+    """Return cameras at the height of robots' heads that look around the room or at the
     robot in its middle."""
     rng = np.random.default_rng(3)
     cameras = []
@@ -282,7 +283,7 @@ def cameras_in_room(count: int, size: int) -> list[v3dg.Camera]:
 
 
 def batch_on(cameras: list[v3dg.Camera], device: str) -> v3dg.CameraBatch:
-    """The cameras of one size as a batch, on the device."""
+    """Return cameras of one size as a batch on the device."""
     batch = v3dg.CameraBatch.of(cameras)
     if device == "cpu":
         return batch
@@ -294,15 +295,15 @@ def batch_on(cameras: list[v3dg.Camera], device: str) -> v3dg.CameraBatch:
 
 
 class Timing(Protocol):
-    """The options of a measurement that say how often calls are timed, and where."""
+    """The options of a measurement: the device, and how often calls are timed."""
 
     device: str
     repeats: int
 
 
 def rate(draw: Callable[[], object], count: int, config: Timing, calls: int = 5) -> float:
-    """Results a second, from an idle device to an idle device, of several calls in a
-    row (on the CPU, one); the median of repeats."""
+    """Return results per second. Several calls in a row (on the CPU, one) are timed
+    from idle device to idle device; the result is the median of the repeats."""
     if config.device != "cuda":
         calls = 1
     times = []

@@ -1,9 +1,9 @@
-"""Pictures of gaussians without levels for several cameras, and their gradients: all
-cameras in one call of `compat.gsplat.rasterization`, in comparison with one call for
-each camera and, if it is installed, with gsplat.
+"""Pictures of gaussians without levels for several cameras, and their gradients. One
+call of `compat.gsplat.rasterization` for all cameras is compared with one call per
+camera and, if gsplat is installed, with gsplat.
 
-Before it is timed, the call is checked: pictures and gradients must have the same bits
-as those of the cameras one after another.
+Before the times are measured, pictures and gradients are checked: they must have the
+same bits as those of the cameras one after another.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Config:
     gaussians: tuple[int, ...] = (10_000, 100_000, 1_000_000)
     cameras: tuple[int, ...] = (64, 64, 16, 4)
     sizes: tuple[int, ...] = (64, 128, 256, 1024)
-    """The side of the pictures for each number of cameras."""
+    """Widths and heights of the pictures in px, for each number of cameras."""
     repeats: int = 9
     output: str | None = None
 
@@ -108,7 +108,7 @@ class Calls:
         return pictures
 
     def step(self, draw: Callable[[], list[torch.Tensor]]) -> Sequence[torch.Tensor | None]:
-        """Draw, and return the gradients."""
+        """Draw the pictures; return the gradients."""
         pictures = draw()
         weights = torch.split(self.weights, len(pictures[0]))
         losses = [(p * w).sum() for p, w in zip(pictures, weights, strict=True)]

@@ -64,7 +64,7 @@ def bytes_of(bundle):
     torch.cuda.empty_cache()
     before = memory()
     model, table = residency.model(bundle, _device.resolve(DEVICE)), residency.table(bundle)
-    # Places the tables on the device.
+    # The tables are copied to the device.
     placed = residency.scene(bundle, _device.resolve(DEVICE))
     resident = model.bytes + table.bytes_on(0)
     done = {

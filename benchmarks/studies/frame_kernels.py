@@ -129,7 +129,7 @@ def measure(frame: Frame) -> Row:
 
     def draw() -> Any:
         image = renderer.render(camera, **options)
-        return image, image.stats  # waits for the picture
+        return image, image.stats  # reading the statistics waits for the picture
 
     for _ in range(_WARM_UPS):
         image, stats = draw()

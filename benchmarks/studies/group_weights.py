@@ -1,19 +1,21 @@
-"""Whether weights of groups that are measured need fewer gaussians for the same error.
+"""Measures whether weights of groups, computed from measured errors, give the same
+error with fewer gaussians.
 
     python -m benchmarks.studies.group_weights donut.ply massa.sog --refine 0 30000 \\
         --layout donutsea.json --device cuda -o group_weights_h100.json
 
-In pictures of the whole asset, each level is compared with the level below it, at
+Each level is compared with the level below it in pictures of the whole asset, at
 several sizes and from several sides. The loss of a pixel is its blurred difference to
-the supersampled asset to the power of 0.7. It is shared out to groups by the blend
-weights of their leaves, as in csrc/levels/first_selected.cpp. What one level less costs
-a group, for each gaussian that it saves, changes its weight; weights never decrease
-towards the root, so that cuts stay exact.
+the supersampled asset, raised to the power of 0.7. It is distributed over groups by the
+blend weights of their leaves, as in csrc/levels/first_selected.cpp. The weight of a
+group depends on how much the loss rises, for each gaussian that is saved, if the group
+is drawn one level coarser. Weights never decrease towards the root, so that cuts stay
+exact.
 
-Cuts by measured weights and by those of the build are then compared over tolerances,
-in views of the asset, of a field of its instances, and of crops of a layout: FLIP at
-equal counts, and counts at equal FLIP. The latter is the least count of either curve
-that has no larger FLIP.
+Cuts with the measured weights are then compared with cuts with the weights of the
+build, at many tolerances, in views of the asset, of a field of its instances, and of
+crops of a layout. The study reports FLIP at equal counts and counts at equal FLIP. The
+latter uses the smallest count on each curve whose FLIP is not larger.
 """
 
 from __future__ import annotations
@@ -41,9 +43,11 @@ from v3dg.gaussians import Gaussians
 Row = dict[str, Any]
 Floats = np.ndarray[Any, Any]
 
-_SIZES = 1.0, 2.0, 4.0, 8.0, 16.0  # px² of the ball for each gaussian, of the median group
-_COUNTED = slice(2, None)  # the sizes at which a level less costs more than noise
-_DISTANCE = 8.0  # of cameras, in radii
+# sizes as px² of the ball per gaussian, for the median group
+_SIZES = 1.0, 2.0, 4.0, 8.0, 16.0
+# the sizes at which the error of a coarser level exceeds the noise
+_COUNTED = slice(2, None)
+_DISTANCE = 8.0  # distance of the cameras, in radii
 _SH_0 = 0.28209479177387814
 _TOLERANCES = 3.0, 4.5, 6.5, 9.4, 13.0
 _ALL_TOLERANCES = 1.6, 2.2, 3.0, 3.7, 4.5, 5.4, 6.5, 7.8, 9.4, 11.2, 13.0, 16.0, 20.0, 26.0
@@ -54,15 +58,15 @@ class Config:
     assets: tyro.conf.Positional[tuple[Path, ...]]
     """Files of gaussians."""
     refine: tuple[int, ...] = (0,)
-    """Numbers of pictures of refinements, each of which is measured."""
+    """Numbers of pictures for the refinements to measure."""
     layout: Path | None = None
     """A layout of instances of the first asset."""
     cameras: tuple[int, ...] = (46, 50, 53, 59)
     """Indices of the layout's cameras."""
     widths: tuple[int, ...] = (400, 200, 100, 50)
-    """Of views of single assets, px."""
+    """Widths in px of views of single assets."""
     field: int = 0
-    """Instances on each side of a field; 0 leaves it out."""
+    """Number of instances on each side of a field; 0 measures no field."""
     sides: int = 8
     """Number of sides from which groups are measured."""
     device: Literal["cpu", "cuda"] = "cuda"
@@ -73,15 +77,16 @@ class Config:
 
 @dataclass(frozen=True)
 class Rule:
-    """How weights follow from what was measured.
+    """A rule that computes weights from measured errors.
 
     Attributes:
-        at_px2: The px² for each gaussian at which levels shall change on average.
-        added_mean: The share of its level's mean that is added to what a group costs.
+        at_px2: The average size, in px² per gaussian, at which levels should change.
+        added_mean: The fraction of the level's mean that is added to each group's
+            error.
         limit: The largest factor of a weight.
-        by_level: Whether levels differ.
-        by_group: Whether the groups of a level differ.
-        sides: The number of sides that count; None for all.
+        by_level: Whether levels may have different weights.
+        by_group: Whether the groups of a level may have different weights.
+        sides: The number of sides to use; None means all.
     """
 
     at_px2: float = 6.0
@@ -106,11 +111,11 @@ class Measured:
     """The groups of a level.
 
     Attributes:
-        groups: (G,) their indices.
-        cost: (S, K, G) loss of this level less that of the level below, in pictures of
-            S sizes from K sides.
-        px2: (S, G) px² of the ball for each gaussian.
-        count: (G,) gaussians.
+        groups: (G,) the indices of the groups.
+        cost: (S, K, G) how much larger the loss of this level is than that of the level
+            below, in pictures of S sizes from K sides.
+        px2: (S, G) px² of the group's ball per gaussian.
+        count: (G,) the numbers of gaussians.
     """
 
     groups: Floats
@@ -189,7 +194,7 @@ class Pictures:
         return torch.as_tensor(metrics.box_downsample(color, samples))
 
     def shares(self, camera: Camera, losses: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Return (N, 2) what each leaf has of two pictures of losses."""
+        """Return (N, 2) the part of each leaf in two pictures of losses."""
         sh = self.black.clone().requires_grad_()
         leaves = self.leaves
         black = Gaussians(leaves.means, leaves.quats, leaves.scales, leaves.opacities, sh)
@@ -246,7 +251,8 @@ def measure(bundle: v3dg.Bundle, config: Config) -> dict[int, Measured]:
 def compared(
     pictures: Pictures, camera: Camera, level: int, coarse: Gaussians, fine: Gaussians
 ) -> torch.Tensor:
-    """Return (N, 2) the losses of a level and of the one below it, by leaf."""
+    """Return (N, 2) the losses of a level and of the one below it, distributed over the
+    leaves."""
     samples = 8
     if level <= 2:
         samples = 4
@@ -262,7 +268,8 @@ def compared(
 
 
 class Curve:
-    """What a level less costs for each gaussian that it saves, by px² a gaussian."""
+    """How much the loss rises with one level less, per gaussian that is saved, as a
+    function of px² per gaussian."""
 
     def __init__(self, measured: Measured, cost: Floats) -> None:
         log_px2 = [np.average(np.log(row), weights=measured.count) for row in measured.px2]
@@ -279,8 +286,7 @@ class Curve:
 def measured_weights(
     bundle: v3dg.Bundle, levels: dict[int, Measured], rule: Rule
 ) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """Return (G,) weights, with which every group is refined where that gains the
-    same."""
+    """Return (G,) weights with which refining any group gains the same per gaussian."""
     weight = bundle.groups.weight.astype(float)
     grid = np.exp(np.linspace(math.log(0.75), math.log(24), 121))
     costs = {n: m.cost[:, : rule.sides].mean(axis=1) for n, m in levels.items()}
@@ -329,10 +335,10 @@ class View:
     """Pictures that are compared together.
 
     Attributes:
-        name: What they show.
-        scene_of: Returns what is drawn, of a bundle.
-        cameras: Not those that measured.
-        samples: Samples on each side of a pixel of the truth.
+        name: The subject of the pictures.
+        scene_of: A function that returns the scene for a bundle.
+        cameras: Cameras that were not used for the measured weights.
+        samples: Samples per side of a pixel of the reference pictures.
     """
 
     name: str
@@ -421,7 +427,8 @@ def flip_of(pair: tuple[Floats, Floats]) -> float:
 def curve_of(
     pool: ProcessPoolExecutor, view: View, bundle: v3dg.Bundle, truths: list[Floats], device: str
 ) -> Floats:
-    """Return (T, 2) mean gaussians in the frustum and mean FLIP at each tolerance."""
+    """Return (T, 2) the mean number of gaussians in the frustum and the mean FLIP at
+    each tolerance."""
     scene = view.scene_of(bundle)
     pairs = []
     counts = []
@@ -437,7 +444,8 @@ def curve_of(
 
 
 def fewest(curve: Floats, flip: float) -> float:
-    """Return the least count of a curve with at most this FLIP; NaN beyond its ends."""
+    """Return the smallest count on a curve with at most this FLIP; NaN if the curve
+    does not reach it."""
     by_count = curve[np.argsort(curve[:, 0])]
     good = np.flatnonzero(by_count[:, 1] <= flip)
     if len(good) == 0 or good[0] == 0:
@@ -448,8 +456,8 @@ def fewest(curve: Floats, flip: float) -> float:
 
 
 def ratios(old: Floats, new: Floats) -> Row:
-    """Return ratios of FLIP at equal counts, and of counts at equal FLIP, for each of
-    the tolerances that are reported."""
+    """Return the ratios of FLIP at equal counts and of counts at equal FLIP, for each
+    reported tolerance."""
     order = np.argsort(new[:, 0])
     flips = []
     counts = []
@@ -469,7 +477,7 @@ def ratios(old: Floats, new: Floats) -> Row:
 
 
 def rounded(values: Sequence[float]) -> list[float | None]:
-    """JSON has no NaN."""
+    """Return a number for JSON, which has no NaN."""
     numbers: list[float | None] = []
     for value in values:
         if math.isnan(value):

@@ -1,12 +1,13 @@
-"""The error of pictures through lenses: the projection is linearised at the mean of
-each gaussian, and is compared with rays in float64.
+"""The error of pictures through lenses. The projection, which is linearised at the mean
+of each gaussian, is compared with rays in float64.
 
     python -m benchmarks.studies.lenses
 
-The reference has the ray of each pixel's centre, and as the falloff of a gaussian its
-largest value on the ray, in front of the eye. Gaussians are blended in the same order,
-without a filter. The table has mean and largest differences of alpha and colour, by
-camera and by the size of the gaussians: their standard deviation as an angle.
+The reference traces a ray through the centre of each pixel. The falloff of a gaussian
+is its largest value on the ray in front of the eye. Gaussians are blended in the same
+order as in the pictures, without a filter. The table has mean and largest differences
+of alpha and colour, by camera and by the size of the gaussians, which is their standard
+deviation as an angle.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from v3dg.rotations import rotation_from_quaternion
 _WIDTH = 160
 _HEIGHT = 120
 _NUM_GAUSSIANS = 400
-_SIZES = (0.5, 2.0, 8.0)  # degrees
+_SIZES = (0.5, 2.0, 8.0)  # in degrees
 _MIN_ALPHA = 1 / 255
 _MAX_ALPHA = 0.999
 _MIN_TRANSMITTANCE = 1e-4
@@ -74,7 +75,7 @@ def random_gaussians(rng: np.random.Generator, degrees: float, most_angle: float
 
 
 def traced(gaussians: Gaussians, camera: Camera) -> tuple[Floats, Floats]:
-    """Return colour and alpha along rays, in float64, of a camera in the origin."""
+    """Return colour and alpha along rays from a camera at the origin, in float64."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = camera.directions(np.column_stack([columns.ravel(), rows.ravel()]))
     means = gaussians.means.astype(np.float64)

@@ -1,5 +1,5 @@
-"""Would a metric that is based on measured errors be better than the footprint per
-gaussian?
+"""Measures whether a metric that is based on measured errors would be better than the
+footprint per gaussian.
 
 Each group of a bundle is drawn alone at several sizes, together with its clusters one
 level finer and with its leaves (4 x 4 samples per pixel). This gives the gain per

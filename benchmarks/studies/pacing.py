@@ -1,5 +1,5 @@
-"""How even are the frame times of a flight? Percentiles over 5,000 frames, and the
-number of frames that were drawn twice."""
+"""Measures how even the frame times of a flight are: percentiles over 5,000 frames, and
+the number of frames that were drawn twice."""
 
 from __future__ import annotations
 
@@ -142,11 +142,10 @@ def measure(renderer: Renderer, views: list[Camera], options: dict[str, float]) 
 
 
 def of_neighbours(milliseconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return each frame's time over the median of the frames around it.
+    """Return each frame's time divided by the median of the frames around it.
 
-    The number of gaussians changes along a flight, and the time of a frame with it.
-    The ratio leaves that out: it says how much longer than its neighbours a frame
-    takes.
+    The time of a frame changes with the number of gaussians along a flight. The ratio
+    is independent of this. It shows how much longer than its neighbours a frame takes.
     """
     window = min(_NUM_NEIGHBOURS, len(milliseconds) // 2 * 2 - 1)
     padded = np.pad(milliseconds, window // 2, mode="reflect")

@@ -30,7 +30,7 @@ from v3dg.levels import BuildConfig
 from v3dg.metrics import flip
 from v3dg.pictures import Picture, read_picture, to_8bit
 
-_SH_CONSTANT = 0.28209479177387814  # Y_00
+_SH_CONSTANT = 0.28209479177387814  # the value of the SH function of degree 0
 
 
 @dataclass

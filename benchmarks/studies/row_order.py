@@ -1,4 +1,5 @@
-"""Are frames faster if neighbouring rows of a cluster are also neighbours in space?
+"""Measures whether frames are faster if neighbouring rows of a cluster are also
+neighbours in space.
 
     python -m benchmarks.studies.row_order --asset donut.ply --layout donutsea.json \\
         --device cuda -o row_order_h100.json

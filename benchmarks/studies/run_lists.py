@@ -1,19 +1,19 @@
-"""How long would the lists of tiles be if they held runs of records?
+"""Estimates how long the lists of tiles would be if they held runs of records.
 
     python -m benchmarks.studies.run_lists \\
         --layout donutsea.json --bundle donut.v3dg --tolerance 9.4 -o run_lists
 
-On CUDA, each record puts an entry of 8 bytes into the list of every tile that it may
-reach. A warp writes up to 32 records of neighbouring gaussians at once: a run. If
-lists held pairs of a run and a tile, a block would take the runs of its tile by their
-nearest depth, and find their entries itself.
+On CUDA, each record adds an entry of 8 bytes to the list of every tile that it may
+reach. A warp writes up to 32 records of neighbouring gaussians at once, which form a
+run. If lists held pairs of a run and a tile, a block would process the runs of its tile
+by their nearest depth, and find their entries itself.
 
-For each camera, the study projects the cut and counts records, entries and pairs.
-It also follows the lists from front to back: how many pairs a tile takes until its
-pixels have stopped, how many entries these pairs have, and how many entries wait at
-once because a run that was not taken may be nearer. A tile counts as stopped when the
-mean of its gaussians' opacities, as an optical depth over its pixels, exceeds
-`--depth`; that is an estimate.
+For each camera, the study projects the cut and counts records, entries and pairs. It
+also follows the lists from front to back. It counts the pairs that a tile processes
+until its pixels have stopped, the entries of these pairs, and the entries that wait at
+once because a later run may be nearer. A tile counts as stopped when its mean optical
+depth exceeds `--depth`, which is an estimate. The optical depth is computed from the
+opacities of the tile's gaussians.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from v3dg.select import Selection
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-# As in csrc/frame.
+# The same as in csrc/frame.
 _TILE_WIDTH = 32  # px
 _TILE_HEIGHT = 16  # px
-_FEW_TILES = 4  # records over more tiles are large
-_ITEM = 256  # gaussians of an item
-_RUN = 32  # records of a run
+_FEW_TILES = 4  # a record that covers more tiles is large
+_ITEM = 256  # number of gaussians of an item
+_RUN = 32  # number of records of a run
 _MIN_ALPHA = 1 / 255
-_AT_ONCE = 1_000_000  # gaussians that are projected together
+_AT_ONCE = 1_000_000  # number of gaussians that are projected together
 # The blend stage sorts at most this many entries at once.
 _PIECE = 768
 
@@ -64,8 +64,9 @@ class Config:
 
 @dataclass
 class Records:
-    """(N,) records in the order of a frame: boxes of tiles, depths, runs, and the
-    optical depth that a record adds to all its tiles, times the pixels of a tile."""
+    """(N,) records in the order of a frame: boxes of tiles, depths, runs and optical
+    depths. The optical depth is what a record adds to all its tiles, multiplied by the
+    number of pixels of a tile."""
 
     left: Ints
     right: Ints
@@ -123,8 +124,8 @@ def items_of(part: Selection) -> Ints:
 
 
 def pieces_of(keys: Ints, size: int) -> Ints:
-    """Return the piece of each element, where neighbours with one key are cut into
-    pieces of up to `size`."""
+    """Return the index of each element's piece. Consecutive elements with equal keys
+    are divided into pieces of at most `size`."""
     first = np.flatnonzero(np.r_[True, np.diff(keys) != 0])
     length = np.diff(np.r_[first, len(keys)])
     within = np.arange(len(keys)) - np.repeat(first, length)
@@ -158,7 +159,7 @@ def project(part: Selection, camera: Camera) -> Records:
 def records_of(
     camera: Camera, centers: Floats, conics: Floats, depths: Floats, opacities: Floats, item: Ints
 ) -> Records:
-    """Return the records of gaussians that reach a pixel centre."""
+    """Return the records of the gaussians whose boxes contain a pixel centre."""
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = 2 * np.log(np.maximum(opacities / _MIN_ALPHA, 1))
         determinant = conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2
@@ -246,7 +247,8 @@ def follow(config: Config, entries: Entries, nearest: Floats) -> JsonObject:
         taken_entries += int(stop)
         taken_pairs += len(pairs)
         listed_records += int((near <= depth[stop - 1]).sum())
-        # After each piece, entries of runs that begin before this depth are waiting.
+        # After each piece, the entries of runs that begin before this depth are
+        # waiting.
         for k in range(_PIECE // 2, stop, _PIECE // 2):
             waiting.append(int((near[k:] <= depth[k]).sum()))
     return {

@@ -1,10 +1,11 @@
-"""What do many small pictures cost beside those of other renderers, and how far is each
-from the supersampled picture?
+"""Measures the time and the error of many small pictures, in comparison with other
+renderers.
 
-`make` builds different assets into a folder. `measure` stands them on a floor and draws
-the same cameras at eye level with a batch of v3dg, with gsplat 1.5 and, if they can be
-imported, with the vectorized renderer for Isaac Sim and the ray-traced sensor of
-Newton. The others get all gaussians in world space. The study needs a GPU.
+`make` builds different assets in a folder. `measure` places them on a floor and draws
+cameras at eye level with a batch of v3dg, with gsplat 1.5 and, if they can be imported,
+with the vectorized renderer for Isaac Sim and the ray-traced sensor of Newton. Errors
+are relative to supersampled pictures. The other renderers draw all gaussians in world
+space. The study needs a GPU.
 """
 
 from __future__ import annotations
@@ -40,10 +41,12 @@ Row: TypeAlias = dict[str, object]
 
 _SIDE = 2.4  # longest side of an object in units
 _AISLE = 0.25  # half the width of the aisles between objects in units
-_SAMPLES = 8  # of a reference picture along each side of a pixel of the largest size
-_FEW = 4  # judged cameras that are drawn together
-_PEER_REPEATS = 3  # timed calls of other renderers
-_TRANSMITTANCES = (0.49, 0.01)  # of Newton: its default, and one for semitransparent pixels
+# samples of a reference picture along each side of a pixel of the largest size
+_SAMPLES = 8
+_FEW = 4  # number of compared cameras that are drawn together
+_PEER_REPEATS = 3  # number of timed calls of other renderers
+# of Newton's sensor: the default, and one for semitransparent gaussians
+_TRANSMITTANCES = (0.49, 0.01)
 _SCENE_ID = 0  # the name of the only scene of the vectorized renderer
 
 
@@ -53,7 +56,7 @@ class Make:
 
     folder: Path
     gaussians: int = 125_000
-    """Gaussians of an asset."""
+    """Number of gaussians of an asset."""
     quality: Literal["draft", "standard"] = "draft"
     device: str = "cuda"
 
@@ -66,13 +69,14 @@ class Measure:
     objects: int = 16
     cameras: int = 256
     judged: int = 32
-    """Cameras whose pictures are compared with supersampled ones."""
+    """Number of cameras whose pictures are compared with supersampled ones."""
     sizes: tuple[int, ...] = (64, 128, 256)
     tolerances: tuple[float, ...] = (0.0, 1.0, 3.0, 6.0, 12.0, 24.0, 48.0)
     batches: tuple[int, ...] = (64, 16, 4)
-    """Cameras that the other renderers draw in one call; the fastest counts."""
+    """Numbers of cameras that the other renderers draw in one call; the fastest is
+    reported."""
     timed: int = 64
-    """Cameras of which the others' rate is measured."""
+    """Number of cameras with which the rate of the other renderers is measured."""
     repeats: int = 7
     device: str = "cuda"
     output: Path | None = None
@@ -124,8 +128,8 @@ def assets_of(count: int) -> Iterator[tuple[str, v3dg.Gaussians]]:
 
 
 def flat(asset: v3dg.Gaussians) -> v3dg.Gaussians:
-    """Return an asset whose colours do not depend on the view, which is what the
-    vectorized renderer can draw."""
+    """Return an asset whose colours do not depend on the view, because the vectorized
+    renderer can only draw such assets."""
     return v3dg.Gaussians(
         asset.means,
         asset.quats,
@@ -227,7 +231,8 @@ class Gsplat:
 
 @dataclass
 class Vectorized:
-    """The vectorized renderer for Isaac Sim: only colours, and no filter."""
+    """The vectorized renderer for Isaac Sim, which draws only colours, and without a
+    filter."""
 
     gaussians: v3dg.Gaussians
     name: str = "vectorized"
@@ -271,8 +276,8 @@ class Vectorized:
 class NewtonSensor:
     """`newton.sensors.SensorCamera`, which traces a ray for each pixel.
 
-    A pixel that more light passes than `transmittance` is left empty, so small values
-    are needed for rays to gather what is semitransparent.
+    A pixel whose transmittance stays above `transmittance` is left empty, so only with
+    small values do rays gather semitransparent gaussians.
     """
 
     gaussians: v3dg.Gaussians
@@ -336,8 +341,8 @@ class NewtonSensor:
         return builder.finalize(device=self.device)
 
     def _transforms(self, viewmats: torch.Tensor) -> warp.array:
-        """Return poses from camera to world, whose cameras look along -z. They are
-        computed once, because the time of a draw does not include them."""
+        """Return poses from camera to world; cameras look along -z. They are computed
+        once, because they are not part of the time of a draw."""
         import warp
 
         key = (viewmats.data_ptr(), *viewmats.shape)
@@ -375,7 +380,7 @@ class Comparison:
         self.judge.close()
 
     def _fine_pictures(self) -> list[Picture]:
-        """Draw all gaussians for the judged cameras, with several samples along each
+        """Draw all gaussians for the compared cameras, with several samples along each
         side of a pixel of the largest size."""
         return [
             np.asarray(metrics.box_downsample(self._fine(camera), _SAMPLES), dtype=np.float32)
@@ -411,8 +416,8 @@ class Comparison:
             yield {"at_error_of": fastest["renderer"], **row}
 
     def _peers(self) -> list[list[Peer]]:
-        """Return the modes of each other renderer that can be imported. The modes of
-        one have the same pictures."""
+        """Return, for each other renderer that can be imported, its modes. All modes of
+        a renderer give the same pictures."""
         peers: list[list[Peer]] = []
         if self.config.device == "cpu":
             return peers
@@ -434,8 +439,9 @@ class Comparison:
         judged = cameras[: len(truths)]
         renderer = self.renderer
         if tolerance == 0:
-            # All gaussians, for as many cameras as the others are timed with. Batches
-            # that do not fit make the parts of a renderer smaller for good.
+            # All gaussians are drawn for as many cameras as the other renderers are
+            # timed with. If a batch does not fit into memory, the renderer divides all
+            # later batches, too.
             cameras = cameras[: self.config.timed]
             renderer = self.renderer_of_all
         batch = bench_sensors.batch_on(cameras, self.config.device)
@@ -463,7 +469,7 @@ class Comparison:
         }
 
     def _peer_rows(self, peer: Peer, size: int, truths: list[Picture]) -> Iterator[Row]:
-        """Yield a row for each number of cameras in a call that fits into memory."""
+        """Yield a row for each number of cameras per call that fits into memory."""
         import torch
 
         cameras = self._cameras_of(size)
@@ -505,8 +511,8 @@ class Comparison:
         }
 
     def _errors(self, truths: list[Picture], pictures: Picture) -> Row:
-        """Return the mean of FLIP and PSNR of 8-bit pictures, and the root of the mean
-        square error over all of them."""
+        """Return the means of FLIP and PSNR of 8-bit pictures, and the root mean square
+        error over all of them."""
         pairs = [(truth, to_8bit(picture)) for truth, picture in zip(truths, pictures, strict=True)]
         rows = self.judge.errors(pairs)
         squares = [np.square((a.astype(np.float64) - b) / 255).mean() for a, b in pairs]

@@ -1,15 +1,16 @@
-"""The error of equirectangular pictures, against rays in float64.
+"""The error of equirectangular pictures relative to rays in float64.
 
     python -m benchmarks.studies.spheres
 
-Three ways to draw one: the projection of each gaussian linearised in longitude and
-latitude (EWA, in float64, seams drawn on both sides), the 26 pinhole pictures of
-`v3dg.draw_panorama`, and the rays of `v3dg.EquirectangularCamera`. The reference has
-the ray of each pixel's centre, and the largest value of each gaussian on the ray. It
-blends in the order of the means for the first two, as they do, and in the order of the
-largest values for the third. The table has the mean and the 99th percentile of the
-differences of colour and alpha, by latitude and by the size of the gaussians: their
-standard deviation as an angle.
+There are three ways to draw such a picture: the projection of each gaussian, linearised
+in longitude and latitude (EWA, in float64, with seams drawn on both sides); the 26
+pinhole pictures of `v3dg.draw_panorama`; and the rays of `v3dg.EquirectangularCamera`.
+The reference traces the ray of each pixel's centre and uses the largest value of each
+gaussian on it. Like the picture that it is compared with, it blends by the distance of
+the means for the first two ways, and by that of the largest values for the third. The
+table has the mean and the 99th percentile of the differences of colour and alpha, by
+latitude and by the size of the gaussians, which is their standard deviation as an
+angle.
 """
 
 import argparse
@@ -24,8 +25,8 @@ from v3dg.rotations import rotation_from_quaternion
 
 _WIDTH = 192
 _NUM_GAUSSIANS = 600
-_SIZES = (0.5, 2.0, 8.0)  # degrees
-_BANDS = ((0, 30), (30, 60), (60, 80), (80, 90))  # degrees of latitude
+_SIZES = (0.5, 2.0, 8.0)  # in degrees
+_BANDS = ((0, 30), (30, 60), (60, 80), (80, 90))  # in degrees
 _MIN_ALPHA = 1 / 255
 _MAX_ALPHA = 0.999
 
@@ -55,7 +56,8 @@ def _covariance(gaussians: Gaussians, i: int) -> Floats:
 
 
 def alphas_on_rays(gaussians: Gaussians, rays: Floats) -> tuple[Floats, Floats]:
-    """Return (N, R) alphas and ranges of the largest values on rays."""
+    """Return alphas (N, R), and ranges (N, R) at which gaussians have their largest
+    values on rays."""
     alphas = np.zeros((len(gaussians), len(rays)))
     ranges = np.zeros_like(alphas)
     for i in range(len(gaussians)):
@@ -97,8 +99,8 @@ def alphas_by_projection(gaussians: Gaussians, width: int) -> Floats:
 
 
 def blended(gaussians: Gaussians, alphas: Floats, order: Floats) -> Floats:
-    """Return (R, 4) colour and alpha; `order` is (N, R), by which gaussians are
-    blended."""
+    """Return (R, 4) colour and alpha. Gaussians are blended by ascending `order` (N,
+    R)."""
     blendable = np.where(alphas >= _MIN_ALPHA, np.minimum(alphas, _MAX_ALPHA), 0)
     shade = np.maximum(0.28209479177387814 * gaussians.sh[:, 0].astype(np.float64) + 0.5, 0)
     rank = np.argsort(order, axis=0, kind="stable")
@@ -115,7 +117,7 @@ def _drawn(image: v3dg.Image) -> Floats:
 
 
 def differences(gaussians: Gaussians) -> dict[str, Floats]:
-    """Return (R, 4) absolute differences to rays, by the way of drawing."""
+    """Return the absolute differences (R, 4) to rays for each way of drawing."""
     camera = EquirectangularCamera(np.eye(4), _WIDTH)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = camera.directions(np.column_stack([columns.ravel(), rows.ravel()]))

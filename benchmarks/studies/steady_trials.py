@@ -1,11 +1,12 @@
-"""What makes motion steadier, besides a fade? A budget whose tolerance changes in
-steps, hysteresis, pages that fade in, and other ramps of the fade.
+"""Measures what makes motion steadier besides a fade: a budget whose tolerance changes
+in steps, hysteresis, pages that fade in, and other ramps of the fade.
 
-A budget in steps is compared with the tolerance that each view needs by itself, also in
-frames after the camera has stopped where the steps are farthest behind. The other
-trials are experiments. Hysteresis uses cuts with a state, which are computed from the
-metrics of the selection. Pages that fade in are simulated in addition to what a pool
-does. Ramps have no state. docs/notes/experiments/index.md lists the results.
+A budget in steps is compared with the tolerance that each view needs by itself. The
+comparison includes frames after the camera has stopped where the steps are farthest
+behind. The other trials are experiments. Hysteresis uses cuts with a state, which are
+computed from the metrics of the selection. Pages that fade in are simulated in addition
+to those of a pool. Ramps have no state. docs/notes/experiments/index.md lists the
+results.
 """
 
 from __future__ import annotations

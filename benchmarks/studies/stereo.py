@@ -1,4 +1,4 @@
-"""How long do the pictures for both eyes of a headset take? One frame of two pictures
+"""Measures the time of pictures for both eyes of a headset: one frame of two pictures
 with a shared cut, in comparison with two frames."""
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from benchmarks.evaluation.measure import time_ms
 from benchmarks.evaluation.record import write
 from v3dg import Bundle, Camera, Renderer, StereoCamera
 
-_FOV = 1.57  # radians, of each eye
+_FOV = 1.57  # field of view of each eye in radians
 _EYE_DISTANCE = 0.064
 
 

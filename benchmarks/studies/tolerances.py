@@ -46,7 +46,7 @@ class Config:
     """Names of the assets to measure; by default all."""
     tolerances: tuple[float, ...] = (1.5, 3.0, 4.5, 6.0, 9.0, 12.0)
     widths: tuple[int, ...] = (512, 256, 128, 64, 32)
-    """px."""
+    """Widths of the pictures in px."""
     views: int = 4
     refine: int = 0
     """Steps of a refinement to measure as well; 0 for none."""

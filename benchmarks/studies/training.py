@@ -1,5 +1,5 @@
-"""Does training with v3dg instead of gsplat give the same result, and how long does a
-step take?
+"""Measures whether training with v3dg gives the same result as training with gsplat,
+and how long a step takes.
 
 Gaussians are trained from random positions on pictures of an asset with gsplat's
 strategies. Pictures are drawn by v3dg or by gsplat, and the results are compared on

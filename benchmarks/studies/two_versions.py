@@ -268,7 +268,7 @@ def main() -> None:
     if arguments.layout:
         from v3dg import read_scene
 
-        # Older versions call it `load`.
+        # Older versions call the function `load`.
         read_asset = getattr(v3dg, "read_asset", None) or v3dg.load
         asset = read_asset(
             arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"]

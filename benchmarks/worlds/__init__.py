@@ -134,8 +134,8 @@ def donut_sea(instances: int = 2048, num_gaussians: int = 45_624, *, seed: int =
     return World("donut_sea", {"donut": asset}, {"donut": placement}, 2.6 * reach)
 
 
-# In units of 1/60 s; after this time the highest donuts have fallen and the pile is at
-# rest.
+# Number of steps of 1/60 s after which the highest donuts have fallen and the pile is
+# at rest.
 _FALL_STEPS = 50
 
 

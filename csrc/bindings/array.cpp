@@ -1,5 +1,5 @@
-// Arrays on the host: checks and allocation. For other devices, the functions call the
-// device's backend.
+// Checks and allocates arrays on the host. For arrays on other devices, these functions
+// call the backend of the device.
 
 #include "bindings/array.h"
 
@@ -52,7 +52,7 @@ std::vector<py::ssize_t> shape_of(const py::handle& array, const char* name) {
 py::object cuda_interface_of(const py::handle& array) {
     PyObject* found = PyObject_GetAttrString(array.ptr(), kInterface);
     if (found != nullptr) return py::reinterpret_steal<py::object>(found);
-    // Do not swallow other errors, such as KeyboardInterrupt.
+    // Pass on all other errors, such as KeyboardInterrupt.
     if (!PyErr_ExceptionMatches(PyExc_AttributeError)) throw py::error_already_set();
     PyErr_Clear();
     return py::none();

@@ -23,7 +23,7 @@ namespace v3dg {
 namespace py = pybind11;
 using namespace py::literals;
 
-// An expected shape; -1 means any length.
+// An expected shape. -1 allows any length.
 using Shape = std::vector<py::ssize_t>;
 std::string shape_text(const Shape& shape);
 std::string shape_text(const py::handle& array);
@@ -104,7 +104,7 @@ Span<T> span_on(Device device, const py::handle& array, const char* name, const 
     return {static_cast<T*>(borrowed.data), borrowed.size};
 }
 
-// Borrows an array like span_on(), and returns its elements; null for None.
+// Borrows an array like span_on(), and returns its elements. For None, returns null.
 template <class T>
 T* elements_or_null(Device device, const py::object& array, const char* name, const Shape& shape) {
     return array.is_none() ? nullptr : span_on<T>(device, array, name, shape).data;
@@ -118,7 +118,7 @@ struct MadeArray {
 };
 MadeArray make_array(Device device, const Element& element, const std::vector<py::ssize_t>& shape);
 
-// A new, uninitialised array, to be filled through `span`.
+// A new, uninitialised array, whose elements are set through `span`.
 template <class T>
 struct NewArray {
     py::object object;
@@ -133,7 +133,7 @@ struct NewArray {
     }
 };
 
-// Makes an array, which `object` then is, and returns its elements, uninitialised.
+// Makes an uninitialised array, stores it in `object`, and returns its elements.
 template <class T>
 T* new_elements(Device device, const Shape& shape, py::object& object) {
     const NewArray<T> array(device, shape);
@@ -143,9 +143,9 @@ T* new_elements(Device device, const Shape& shape, py::object& object) {
 
 class Backend;
 
-// A scope in which work runs on a device: the device is current, and work is enqueued
-// on torch's current stream. The constructor and the destructor require the GIL; the
-// work itself does not. Throws RuntimeError if the device does not exist.
+// A scope in which work runs on a device. The device is current, and work is enqueued
+// on torch's current stream. The constructor and the destructor need the GIL, but the
+// work does not. Throws RuntimeError if the device does not exist.
 class Work {
   public:
     explicit Work(Device device);
@@ -155,7 +155,7 @@ class Work {
 
     Device device() const { return device_; }
     const Backend& backend() const { return backend_; }
-    // Returns the stream of the backend; null on the host.
+    // Returns the stream of the backend, or null on the host.
     void* stream() const { return stream_; }
 
   private:

@@ -1,5 +1,5 @@
-// Maps devices to backends. The only #if of the bindings that depends on a backend is
-// here.
+// Maps devices to backends. This file has the only #if of the bindings that depends on
+// a backend.
 
 #include "bindings/backend.h"
 

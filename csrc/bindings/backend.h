@@ -77,22 +77,23 @@ struct Entered {
 
 // The capabilities of a backend.
 struct BackendTraits {
-    // The host can read the arrays, so the bindings check their values.
+    // whether the host can read the arrays; if so, the bindings check their values
     bool host_reads_arrays;
-    bool computes_doubles;  // can draw and differentiate float64 gaussians
+    bool computes_doubles;  // whether it can draw and differentiate float64 gaussians
     size_t row_alignment;   // alignment of quaternions and SH coefficients, bytes
-    // Supports only plain requests (FrameRequest::is_plain), and no picking.
+    // Whether it only supports plain requests (FrameRequest::is_plain), and no picking.
     bool draws_only_plainly;
 };
 
-// The requirements of a device on a page pool.
+// What a device requires of a page pool.
 struct PoolDemands {
-    // The most bytes of pages that are copied while a few frames are drawn.
+    // Maximum number of bytes of pages that are copied while a few frames are drawn.
     size_t most_block_bytes;
     size_t row_bytes;  // bytes per gaussian of a page that is stored as rows
-    // The most gaussians that can be stored as codes. 0: only PoolMemory limits them.
+    // Maximum number of gaussians that can be stored as codes. If it is 0, only
+    // PoolMemory limits them.
     size_t most_coded_rows;
-    size_t most_frames;  // the most frames whose cuts are in progress
+    size_t most_frames;  // maximum number of frames whose cuts are in progress
     std::shared_ptr<BlockMemory> blocks;
 };
 
@@ -113,7 +114,7 @@ class Model {
     // Returns the memory in bytes, without the arrays that the model was made from.
     virtual size_t bytes() const = 0;
     // Decodes the gaussians of `clusters`. The model must be coded. The gaussians of
-    // clusters[k] are written from row offset[k] on. Called without the GIL.
+    // clusters[k] are written to the rows from offset[k] on. Called without the GIL.
     virtual void decode(Span<const int32_t> clusters, Span<const int64_t> offset, const Work& work,
                         const GaussianRows<float>& out) const = 0;
 };
@@ -132,24 +133,23 @@ class Scene {
     // Replaces all bundles. The caller then calls set_instances().
     virtual void set_bundles(const SceneState& state, const Work& work) = 0;
     // Sets the instances and their poses from `state.arrays`. If the host can read
-    // arrays of this backend, it also copies the poses to `state.instances`. Throws
-    // ValueError or TypeError if an array is wrong, and then changes nothing.
+    // arrays of this backend, also copies the poses to `state.instances`. If an array
+    // is wrong, throws ValueError or TypeError and changes nothing.
     virtual void set_instances(SceneState& state, const Work& work) = 0;
-    // Like set_instances(), but only the poses have changed.
+    // Like set_instances(), if only the poses have changed.
     virtual void set_poses(SceneState& state, const Work& work) = 0;
-    // Selects a cut. Waits. See SelectInput for `last_bin`. Called without the GIL, by
+    // Selects a cut. Waits. SelectInput explains `last_bin`. Called without the GIL, by
     // one thread at a time.
     virtual void select(const SceneState& state, const Eyes& eyes, const SelectRule& rule,
                         uint32_t* last_bin, const Work& work, SelectOutput& out) const = 0;
 };
 
-// The slots of a page pool on a device. The PagePool that it was made from must outlive
-// it.
+// The slots of a page pool on a device. The PagePool must outlive it.
 class Pool {
   public:
     virtual ~Pool() = default;
     // Makes one step towards a state in which all pages of a view are resident. It
-    // brings in all pages that were read, selects the cut, draws nothing, and waits
+    // brings in all pages that were read, selects the cut without drawing it, and waits
     // until the pool has decided about the pages that the cut needs. `begins` marks the
     // first step, which discards the requests of earlier frames
     // (PagePool::begin_settling). Called without the GIL.
@@ -157,16 +157,16 @@ class Pool {
                                      const SelectRule& rule, bool begins, const Work& work) = 0;
 };
 
-// The inputs of a frame. The bindings have checked that they fit each other and the
+// The inputs of a frame. The bindings have checked that they match each other and the
 // frame's models.
 struct FrameInput {
     const FrameRequest& request;
     const Scene& scene;
     std::shared_ptr<const SceneState> state;
-    Pool* pool;  // null: draw the frame's own models
-    // The state of a sequence of pictures; null for a single picture.
+    Pool* pool;  // null if the frame draws its own models
+    // The state of a sequence of pictures, or null for a single picture.
     BudgetSteps* steps;
-    // A flag that asks to end the picture early, if possible. May be null.
+    // A flag that requests to end the picture early, if possible. May be null.
     const std::atomic<bool>* stop;
 };
 
@@ -183,25 +183,26 @@ class Frame {
   public:
     virtual ~Frame() = default;
     // Sets the model of each bundle and, unless `palettes` is empty, its palette. The
-    // frame shares ownership of them.
+    // frame shares their ownership.
     virtual void set_models(std::vector<std::shared_ptr<const Model>> models,
                             std::vector<std::shared_ptr<const Palette>> palettes,
                             const Work& work) = 0;
     // Draws a frame. If the drawing is unfinished on return, it keeps the frame, the
-    // scene, the pool and the request alive (BoundDrawing::keep); they do not change
-    // before it is finished or destroyed. A backend whose frames share buffers uses a
-    // Turn. A request with a given cut has one eye.
+    // scene, the pool and the request alive (BoundDrawing::keep). They do not change
+    // before it is finished or destroyed. If the frames of a backend share buffers, the
+    // backend uses a Turn. A request with a given cut has one eye.
     virtual std::unique_ptr<BoundDrawing> draw(const FrameInput& input) = 0;
-    // Draws a batch of pictures with the frame's own models. Like draw(), but the
+    // Draws a batch of pictures with the frame's own models. Unlike with draw(), the
     // caller owns the planes, which exist until the drawing is finished. A batch that
     // does not fit into memory is drawn in parts.
     virtual std::unique_ptr<BoundBatch> draw_batch(const BatchInput& input) = 0;
     // Finds the gaussian with the largest blend weight in the first pixel of the
-    // window. Returns false if no gaussian is drawn there. Waits. Called only if
+    // window. Returns false if no gaussian is drawn there. Waits. Only called if
     // draws_only_plainly is false.
     virtual bool pick(const FrameInput& input, ScenePick& picked) = 0;
-    // Returns the device memory of the frame in bytes, by part, and the bytes of the
-    // memory pool, from which all parts but the large buffers of a frame are allocated.
+    // Returns the device memory of the frame in bytes, one entry per purpose. Also
+    // returns the bytes of the memory pool, from which everything but the large buffers
+    // of a frame is allocated.
     virtual std::vector<std::pair<const char*, size_t>> memory() const = 0;
 };
 
@@ -216,7 +217,7 @@ class AssetFrame {
 };
 
 // The gaussians that groups or cuts are fitted to. All functions wait, and check
-// FitProgress::cancel now and then. Called without the GIL.
+// FitProgress::cancel now and then. They are called without the GIL.
 class Target {
   public:
     virtual ~Target() = default;
@@ -287,7 +288,7 @@ class Backend {
                         const Work& work) const = 0;
     virtual void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out,
                           const Work& work) const = 0;
-    // The version for float64. Called only if computes_doubles is true.
+    // The float64 version. Only called if computes_doubles is true.
     virtual void ellipses(const EllipsesInput<double>& in, const Ellipses<double>& out,
                           const Work& work) const = 0;
     // Waits, because the sums are in host memory.
@@ -305,7 +306,7 @@ class Backend {
                                                              const Work& work) const = 0;
     virtual std::shared_ptr<const backend::Model> make_model(const py::object& codes,
                                                              const Work& work) const = 0;
-    // Returns a palette. `table` is a ClusterTable; `sh` is (C, 3), the SH coefficients
+    // Returns a palette. `table` is a ClusterTable. `sh` is (C, 3): the SH coefficients
     // of degree 0 of its clusters.
     virtual std::shared_ptr<const backend::Palette> make_palette(const py::object& table,
                                                                  const py::array& sh,
@@ -325,13 +326,13 @@ class Backend {
 
     // ---- gradients
 
-    // Draws gaussians without levels. If `keep_tape`, the result has a tape, which
-    // keeps the gaussians alive.
+    // Draws gaussians without levels. If `keep_tape` is true, the result has a tape,
+    // which keeps the gaussians alive.
     virtual Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera,
                                  const DrawLook& look, bool with_depth, bool keep_tape) const = 0;
-    // Draws gaussians without levels for several pinholes of one size, whose arrays are
-    // on the host. `gaussians` are those of all views, or of each view. Otherwise like
-    // rasterize().
+    // Draws gaussians without levels for several pinhole cameras of one size, whose
+    // arrays are on the host. `gaussians` has one element for all views, or one for
+    // each view. Otherwise like rasterize().
     virtual RasterizedViews rasterize_views(const std::vector<Rows>& gaussians,
                                             const BoundCameras& cameras, const ViewsLook& look,
                                             bool with_depth, bool keep_tape) const = 0;
@@ -340,12 +341,12 @@ class Backend {
 // Returns the backend of a device. Throws RuntimeError if it was not compiled.
 const Backend& backend_of(Device device);
 
-// Return the backend of the host and the backend of devices. The backend of devices is
-// null if none was compiled.
+// Return the backend of the host and that of devices. The latter is null if none was
+// compiled.
 const Backend& host_backend();
 const Backend* device_backend();
 
-// Returns the backend of CUDA devices (cuda_backend.cpp). Defined only if CUDA was
+// Returns the backend of CUDA devices (cuda_backend.cpp). Only defined if CUDA was
 // compiled.
 const Backend& cuda_backend();
 

@@ -25,8 +25,8 @@ const char* expected_of(CameraFault fault) {
     }
 }
 
-// Returns the index of the first invalid camera, and what was expected of it. Returns
-// None if all cameras are valid. The arrays are on the host.
+// Returns the index of the first invalid camera, and what was expected of it. If all
+// cameras are valid, returns None. The arrays must be on the host.
 py::object fault_of_cameras(const py::array& viewmats, const py::array& K) {
     const Span<const double> poses = span_of<const double>(viewmats, "viewmats", {-1, 4, 4});
     const auto count = static_cast<py::ssize_t>(poses.size / 16);

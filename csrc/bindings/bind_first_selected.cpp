@@ -14,7 +14,7 @@ namespace {
 
 constexpr std::array<double, 3> kWhite{1, 1, 1}, kBlack{0, 0, 0};
 
-// The colours of a picture over white.
+// The colours of a picture on white.
 struct Colors {
     py::object object;
     Span<const float> span;
@@ -80,8 +80,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
                              losses.span);
         }
         // Distribute the losses of pixels over the leaves in proportion to their blend
-        // weights. The sum of loss * colour, differentiated with respect to the leaves'
-        // colours, is this distribution.
+        // weights. This distribution equals the derivative of the sum of loss * colour
+        // with respect to the leaves' colours.
         const Rasterized seen = rasterize(black, {{}, camera}, in_black, false, true);
         const Gradients gradients =
             seen.tape->backward(backend.from_host(losses.object, device), py::none(), py::none(),
@@ -93,8 +93,9 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     return py::array_t<float>(num_groups, growth.data());
 }
 
-// Grows the balls of level 1 by `growth`, and the balls of higher levels so that they
-// contain the balls below. Returns the balls of all levels. Level 0 does not change.
+// Multiplies the balls of level 1 by `growth`, and enlarges those of higher levels so
+// that they contain the balls below. Returns the balls of all levels. Level 0 does not
+// change.
 py::list grown_balls(const py::list& balls, const py::array& growth) {
     py::list grown;
     std::vector<Ball> below;

@@ -42,7 +42,7 @@ class BoundTarget {
     std::unique_ptr<backend::Target> target_;
 };
 
-// Returns the groups after checks of their ranges. Target ranges must be within
+// Returns the groups after checking their ranges. Target ranges must be within
 // `num_targets` gaussians, and ranges within `num_rows`.
 std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& range,
                                 const py::array& ball, const py::array& stream, size_t num_targets,
@@ -121,7 +121,7 @@ class BoundPictures {
             py::array_t<int32_t>(static_cast<py::ssize_t>(clusters.size()), clusters.data()),
             view.samples);
     }
-    // Throws ValueError unless there are as many gaussians as in the table.
+    // Throws ValueError unless the number of gaussians is that of the table.
     void check_all(const Rows& gaussians) const {
         if (gaussians.size() > UINT32_MAX)
             throw py::value_error("gaussians: expected fewer than 2^32, got " +

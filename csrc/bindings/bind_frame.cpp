@@ -14,7 +14,7 @@ namespace v3dg {
 
 namespace {
 
-// A flag that asks work in progress to end early. Any thread may set it.
+// A flag that requests work in progress to end early. Any thread may set it.
 class Stop {
   public:
     void request() { requested_.store(true, std::memory_order_relaxed); }
@@ -42,7 +42,7 @@ Eyes eyes_of(const py::object& camera) {
     return camera.cast<const BoundEyes&>().eyes;
 }
 
-// A cut that was selected earlier. The arrays must be on the frame's device; this is
+// A cut that was selected earlier. The arrays must be on the frame's device, which is
 // checked when the frame draws.
 struct BoundGivenCut {
     py::object instance_ids, cluster_ids, weights;
@@ -66,8 +66,8 @@ struct BoundLook {
     bool is_aside = false;
 };
 
-// Throws ValueError if the channel `clipped` is requested for another camera than a
-// pinhole.
+// Throws ValueError if the channel `clipped` is requested for a camera that is not a
+// pinhole camera.
 void check_clipped(const SensorRequest& request, const Camera& camera) {
     if (request.channels.clipped && !camera.is_pinhole())
         throw py::value_error(
@@ -92,12 +92,11 @@ SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes) {
 struct BoundRequest {
     FrameRequest plain;
     std::optional<BoundGivenCut> cut;
-    py::object cluster_colors;  // see BoundLook; null if there is none
+    py::object cluster_colors;  // as in BoundLook; null if there is none
     py::object sensor;          // BoundSensor or None; owns the arrays of the mesh
 
-    // `camera` is a Camera or an Eyes. A test in the constructor is faster than
-    // overloads or implicit conversions, which would take most of the constructor's
-    // time.
+    // `camera` is a Camera or an Eyes, which the constructor tests. Overloads or
+    // implicit conversions would take most of the constructor's time.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
                  const BoundGivenCut* given, const BoundLook* look, py::object channels)
         : plain{.eyes = eyes_of(camera),
@@ -145,7 +144,7 @@ void check_sensor(Device device, const py::object& sensor) {
 }
 
 // Draws scenes on one device. The frame's models belong to the bundles of the scenes,
-// in order; a scene may have fewer bundles.
+// in order. A scene may have fewer bundles.
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
@@ -179,9 +178,9 @@ class BoundSceneFrame {
         num_gaussians_ = std::move(num_gaussians);
     }
 
-    // Draws the models that were set. With a pool, it brings in pages that are ready,
-    // then draws the resident part of the pool. `steps` is the state of a sequence of
-    // pictures; null for a single picture.
+    // Draws the models that were set. With a pool, first brings in pages that are
+    // ready, and then draws the resident part of the pool. `steps` is the state of a
+    // sequence of pictures, or null for a single picture.
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object,
                                        const py::object& request_object,
                                        const py::object& pool_object, BudgetSteps* steps,
@@ -199,8 +198,8 @@ class BoundSceneFrame {
         return drawing;
     }
 
-    // Draws a picture for each camera with the models that were set, into planes of the
-    // caller or into new planes.
+    // Draws a picture for each camera with the models that were set. The planes belong
+    // to the caller, or are new.
     std::unique_ptr<BoundBatch> draw_batch(const py::object& scene_object,
                                            const py::object& cameras_object, const SelectRule& rule,
                                            const Shade& shade, const BoundPlanes* planes,
@@ -248,8 +247,8 @@ class BoundSceneFrame {
         return picked;
     }
 
-    // Returns the device memory of the frame in bytes, by part, and the bytes of the
-    // memory pool.
+    // Returns the device memory of the frame in bytes, one entry per purpose, and the
+    // bytes of the memory pool.
     py::dict memory() const {
         py::dict parts;
         const Work work(device_);
@@ -258,8 +257,9 @@ class BoundSceneFrame {
     }
 
   private:
-    // Returns the meshes and the planes for the channels of a batch: those of the
-    // caller, and new ones for other channels that are requested.
+    // Returns the meshes and the planes for the channels of a batch. Channels that the
+    // caller has planes for are drawn to these planes, and other requested channels to
+    // new ones.
     Sensor sensor_of_batch(const py::object& sensor, const BoundCameras& cameras,
                            const SensorPlanes& planes, NewChannels& channels) const {
         if (sensor.is_none()) return {.planes = planes, .mesh = {}};

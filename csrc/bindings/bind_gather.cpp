@@ -11,8 +11,8 @@ namespace v3dg {
 
 namespace {
 
-// Checks the requested clusters: their instances exist, and their rows are in the
-// instances' bundles.
+// Checks the requested clusters. Their instances must exist, and their rows must be in
+// the instances' bundles.
 void check_clusters(const GatherInput& in) {
     if (in.offset[0] != 0)
         throw py::value_error("offset: expected 0 as the first number, got " +

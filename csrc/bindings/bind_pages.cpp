@@ -61,8 +61,8 @@ void naming_file(const py::object& path, const Body& body) {
     }
 }
 
-// Throws ValueError unless the gaussians are on the host, and are those of the run,
-// whose pages have enough bytes for them.
+// Throws ValueError unless the gaussians are on the host and have the size of the run,
+// and the run's pages have enough bytes for them.
 void check_rows(const PageRun& run, PageCodec codec, const Rows& gaussians, const char* name) {
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
     check_is_on_host(gaussians.device(), name,
@@ -118,7 +118,7 @@ void read_run(const py::object& path, int descriptor, const py::object& out,
     read_rows(path, descriptor, run, page_codec_of(codec), held<Rows>(out, "out"));
 }
 
-// Writes a range of pages; returns (n, 16) their hashes. `path` is for errors.
+// Writes a range of pages, and returns (n, 16) their hashes. `path` is used in errors.
 py::object write_run(const py::object& path, int descriptor, const Rows& gaussians,
                      const std::string& codec, const BoundPageRun& bound) {
     const auto num_pages = static_cast<py::ssize_t>(bound.places.size() - 1);

@@ -1,4 +1,4 @@
-// Bindings that read and write .ply files, by means of io/ply_*.h.
+// Bindings that read and write .ply files with the functions of io/ply_*.h.
 
 #include <cerrno>
 #include <cmath>
@@ -12,15 +12,14 @@ namespace v3dg {
 
 namespace {
 
-// Returns a name as printable ASCII; other bytes become question marks.
+// Returns a name as printable ASCII. Other bytes become question marks.
 std::string printable(std::string name) {
     for (char& c : name)
         if (c < ' ' || c > '~') c = '?';
     return name;
 }
 
-// The name of a file: in the encoding of the system, and in the form that messages
-// show.
+// The name of a file, in the encoding of the system and in the form that messages show.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;
@@ -31,7 +30,7 @@ struct Path {
     py::bytes encoded;
 };
 
-// Calls body(path) without the GIL, and adds the name of the file to errors.
+// Calls body(path) without the GIL. Adds the name of the file to errors.
 template <class Body>
 auto with_path(const Path& path, const Body& body) {
     const char* name = PyBytes_AS_STRING(path.encoded.ptr());
@@ -49,7 +48,7 @@ auto with_path(const Path& path, const Body& body) {
     }
 }
 
-// A .ply file that is read in runs of rows. It remembers where the last run ended.
+// A .ply file that is read in runs of rows. It stores where the last run ended.
 class BoundPlyFile {
   public:
     explicit BoundPlyFile(const py::object& path)
@@ -79,7 +78,7 @@ class BoundPlyFile {
             opacities({}, {n}), sh({}, {n, k, 3});
         const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span,
                                          sh.span};
-        // `next_` is accessed with the GIL held, so several threads may read
+        // `next_` is only accessed with the GIL held, so several threads may read
         // concurrently.
         const PlyPlace known = next_;
         next_ = with_path(path_, [&](const char*) {

@@ -13,7 +13,8 @@ namespace {
 
 // Pages that are being read may use up to 1 / kBlockShare of a pool's memory.
 constexpr size_t kBlockShare = 8;
-// The limit on threads that read pages. They also compute hashes, so more cores help.
+// Maximum number of threads that read pages. They also compute hashes, so more cores
+// help.
 constexpr unsigned kMostThreads = 16;
 
 [[noreturn]] void raise(const PageError& error) {
@@ -47,7 +48,8 @@ struct GivenSource {
     Span<const uint8_t> hashes = {};
 };
 
-// Returns the text of the current Python error, and clears the error. Requires the GIL.
+// Returns the text of the current Python error, and clears the error. The caller must
+// hold the GIL.
 std::string text_of_error() {
     PyObject *type = nullptr, *value = nullptr, *trace = nullptr;
     PyErr_Fetch(&type, &value, &trace);
@@ -61,8 +63,8 @@ std::string text_of_error() {
 }
 
 // Calls a Python function that fetches parts of a file. Returns the text of its error,
-// or an empty string. Requires the GIL. Local objects must not have destructors that
-// need the GIL, because Python may end the thread during the call.
+// or an empty string. The caller must hold the GIL. Local objects must not have
+// destructors that need the GIL, because Python may end the thread during the call.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
@@ -77,9 +79,8 @@ std::string told_by(PyObject* function, Span<const int64_t> places) {
 }
 
 // Wraps a Python function for threads that Python did not start. Such a thread acquires
-// the GIL for the call. A thread that waits for such a thread must therefore release
-// the GIL first. The function is never released, because a pool may leave threads
-// behind that call it.
+// the GIL for the call, so a thread that waits for it must release the GIL first. The
+// function is never destroyed, because a pool may leave threads behind that call it.
 Fetch fetch_by(const py::object& function) {
     if (function.is_none()) return {};
     PyObject* const kept = function.inc_ref().ptr();
@@ -179,7 +180,7 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
 
 BoundPool::~BoundPool() {
     on_device_.reset();
-    // Threads that are ending may be waiting for the GIL to call Python.
+    // Release the GIL, because threads that are ending may wait for it to call Python.
     const Unlocked unlocked;
     pool_.reset();
 }

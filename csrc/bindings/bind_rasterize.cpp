@@ -7,7 +7,7 @@ namespace v3dg {
 
 namespace {
 
-// A drawn picture for Python. `tape` is for the backward pass, or None.
+// A picture for Python. `tape` is the input of the backward pass, or None.
 struct BoundRasterized {
     py::object color, alpha, depth;
     std::optional<RenderCounts> counts;

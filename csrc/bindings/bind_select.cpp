@@ -37,8 +37,8 @@ struct Arguments {
     }
 };
 
-// Returns where the values of each instance begin, and the total at the end. An
-// instance of bundle b has counts[b] values.
+// Returns where the values of each instance begin, then the total number. An instance
+// of bundle b has counts[b] values.
 NewArray<int64_t> offset_of_instances(Span<const int32_t> bundle,
                                       const std::vector<size_t>& counts) {
     NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});

@@ -7,7 +7,7 @@ namespace v3dg {
 
 namespace {
 
-// Drawn views for Python. `tape` is for the backward pass, or None.
+// Views for Python. `tape` is the input of the backward pass, or None.
 struct BoundViews {
     py::object color, alpha, depth;
     py::object tape;

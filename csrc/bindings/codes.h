@@ -12,7 +12,8 @@ inline void check_sh_degree(int sh_degree) {
         throw py::value_error("sh_degree: expected 0 to 3, got " + std::to_string(sh_degree));
 }
 
-// Returns the values of an array, which must not decrease and be from 0 to `count`.
+// Returns the values of an array. They must not decrease, and must be from 0 to
+// `count`.
 inline Span<const int64_t> boundaries_of(const py::array& array, const char* name, size_t count) {
     const Span<const int64_t> values = span_of<const int64_t>(array, name, {-1});
     bool good =
@@ -31,7 +32,7 @@ class BoundCodes {
         : arrays_{std::move(pages), std::move(first_cluster), std::move(offset)} {
         check_sh_degree(sh_degree);
         const Span<const int32_t> words = span_of<const int32_t>(arrays_[0], "pages", {-1});
-        // Indices of rows, and of 8-byte units of codes, have 32 bits.
+        // The indices of rows, and of 8-byte units of codes, have 32 bits.
         constexpr size_t kMostWords = size_t(1) << 33;
         if (words.size > kMostWords)
             throw py::value_error(

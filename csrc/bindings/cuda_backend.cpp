@@ -38,8 +38,8 @@ Borrowed borrow_anywhere(const py::handle& array, const char* name, const Elemen
 
 namespace {
 
-// The functions of torch that every frame needs. They are looked up once. The object is
-// never destroyed, because Python may end before the process.
+// The functions of torch that every frame needs. They are looked up only once. The
+// object is never destroyed, because Python may end before the process.
 struct Torch {
     // current_stream returns the stream as an integer
     py::object empty, current_stream;
@@ -65,8 +65,8 @@ struct Torch {
           int32_(py::module_::import("torch").attr("int32")),
           uint8_(py::module_::import("torch").attr("uint8")) {}
 
-    // Returns the module torch after initialising CUDA. It is for callers that do not
-    // initialise CUDA otherwise.
+    // Returns the module torch after initialising CUDA. Used by callers that do not
+    // initialise CUDA in another way.
     static py::module_ initialised_cuda() {
         py::module_::import("torch.cuda").attr("init")();
         return py::module_::import("torch");
@@ -135,7 +135,8 @@ class CudaBackend final : public Backend {
             return Device{attributes.device};
         cudaGetLastError();
         // An array without elements has no memory, and thus no device. A torch tensor
-        // names its device; any other array counts as being on the current device.
+        // still has the name of its device. Any other array counts as being on the
+        // current device.
         const py::object index =
             py::getattr(py::getattr(array, "device", py::none()), "index", py::none());
         if (py::isinstance<py::int_>(index)) return Device{index.cast<int>()};

@@ -1,6 +1,6 @@
 // Models, scenes, pools and frames on CUDA devices. Frames are enqueued on torch's
-// current stream. The GIL is held meanwhile, because torch allocates the pictures. A
-// Turn keeps other threads from using the buffers of a frame.
+// current stream. The GIL is held while they are enqueued, because torch allocates the
+// pictures. A Turn keeps other threads from using the buffers of a frame.
 
 #include "bindings/cuda_frame.h"
 
@@ -155,7 +155,8 @@ class EnqueuedDrawing final : public BoundDrawing {
             drawing_->wait();
         }
         const Turn turn(*turns_);
-        const FrameCounters& counters = drawing_->finish();  // may draw again
+        // this may draw the frame again
+        const FrameCounters& counters = drawing_->finish();
         if (pages_ != nullptr) pages_->note_frames(stream_of(work));
         const FrameTimes times = drawing_->times();
         const bool exceeds = counters.choice.exceeds_budget;
@@ -179,7 +180,7 @@ class EnqueuedDrawing final : public BoundDrawing {
   private:
     const Device device_;
     const std::shared_ptr<Mutex> turns_;  // shared with the frame
-    // The drawing is destroyed before the objects that it uses.
+    // must be destroyed before the objects that it uses
     const std::unique_ptr<Drawing> drawing_;
     DevicePages* const pages_;  // the pool that provides the gaussians; may be null
     const SelectRule rule_;
@@ -200,7 +201,7 @@ class EnqueuedBatch final : public BoundBatch {
             drawing_->wait();
         }
         const Turn turn(*turns_);
-        drawing_->finish();  // may draw parts again
+        drawing_->finish();  // this may draw parts again
         is_finished_ = !drawing_->is_captured();
     }
 
@@ -223,7 +224,7 @@ class EnqueuedBatch final : public BoundBatch {
   private:
     const Device device_;
     const std::shared_ptr<Mutex> turns_;  // shared with the frame
-    // Destroyed before the objects that it uses.
+    // Must be destroyed before the objects that it uses.
     const std::unique_ptr<BatchDrawing> drawing_;
     bool is_finished_ = false;
 };
@@ -246,7 +247,7 @@ PicturePlanes planes_of(NewPicture& picture, Device device) {
     return {planes.color, planes.alpha, planes.depth, false};
 }
 
-// Returns the pictures of the eyes, without memory yet.
+// Returns the pictures of the eyes. Their memory is not allocated yet.
 EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) {
     FrameImage image[2]{};
     for (int k = 0; k < eyes.count(); ++k) {
@@ -274,7 +275,7 @@ FrameSensors new_sensors(const SensorRequest& request, NewPictures& pictures, De
 }
 
 // Returns a function that allocates the pictures through torch. The frame calls it
-// after the first kernels are enqueued, because allocating is slow.
+// after its first kernels are enqueued, because allocation is slow.
 cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
     return [&pictures, device](PicturePlanes planes[2]) {
         for (size_t k = 0; k < pictures.size(); ++k) planes[k] = planes_of(pictures[k], device);
@@ -342,8 +343,8 @@ class BackendFrame final : public backend::Frame {
         std::unique_ptr<Drawing> drawing =
             frame_.draw(tables_of(input.scene), pages, request, used, images, sensors,
                         stream_of(work), place_of(pictures, device_));
-        // Report the tolerance of the request. With a pool, report the tolerance that
-        // the pool may have raised.
+        // Report the tolerance of the request or, with a pool, the tolerance that the
+        // pool may have raised.
         const SelectRule& reported = pages == nullptr ? request.rule : used;
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), reported, pages);

@@ -41,7 +41,7 @@ std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const back
 
 std::unique_ptr<backend::RayFrame> make_ray_frame();
 
-// Return the memory of handles.
+// Return the objects of the core that handles own.
 const SceneTables& tables_of(const backend::Scene& scene);
 const DeviceModel& model_on_device(const backend::Model& model);
 

@@ -10,7 +10,7 @@ namespace v3dg::cuda {
 
 namespace {
 
-// A part of the views: those from `first` on.
+// The views of one frame, beginning with view `first`.
 struct Part {
     size_t first, count;
     std::unique_ptr<ViewsFrame> frame;
@@ -56,7 +56,7 @@ class DeviceViewsTape final : public ViewsTape {
   private:
     std::vector<Rows> gaussians_;
     std::vector<Part> parts_;
-    std::vector<py::ssize_t> shape_;  // views, height, width
+    std::vector<py::ssize_t> shape_;  // number of views, height, width
 };
 
 // Returns the input of the views from `first` on.

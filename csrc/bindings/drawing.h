@@ -13,10 +13,10 @@
 
 namespace v3dg {
 
-// A Turn gives one thread exclusive use of a frame until the Turn is destroyed. The GIL
-// does not suffice, because torch releases it during allocations. The constructor
-// releases the GIL while it waits, because the thread that uses the frame may need the
-// GIL. Only backends whose frames share buffers need a Turn.
+// Gives one thread exclusive use of a frame until this object is destroyed. The GIL
+// does not suffice for this, because torch releases it during allocations. The
+// constructor releases the GIL while it waits, because the thread that uses the frame
+// may need the GIL. Only backends whose frames share buffers need a Turn.
 class V3DG_SCOPED_CAPABILITY Turn {
   public:
     explicit Turn(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { wait_for(mutex); }
@@ -38,21 +38,21 @@ class V3DG_SCOPED_CAPABILITY Turn {
 
 // The statistics of a frame. Times are in milliseconds.
 struct FrameStats {
-    // Selected gaussians. If exceeds_budget, the gaussians of the coarsest cut.
+    // Number of selected gaussians or, if exceeds_budget, of those in the coarsest cut.
     int64_t gaussians;
     uint64_t in_frustum, records, entries, items;
     float tolerance_px2;
     bool exceeds_budget;
     double select_ms, draw_ms;
-    // Selected gaussians of each level; set on the host only.
+    // Number of selected gaussians of each level. Only set on the host.
     std::vector<int64_t> levels;
-    // The number of times that the frame was drawn: above 1 if a buffer on the device
-    // was too small.
+    // How often the frame was drawn. It is above 1 if a buffer on the device was too
+    // small.
     int num_draws = 1;
 };
 
-// A frame that was drawn, or that was enqueued on a device. A backend that returns
-// before the frame is drawn uses a derived class.
+// A frame that was drawn, or enqueued on a device. A backend that returns before the
+// frame is drawn uses a derived class.
 class BoundDrawing {
   public:
     BoundDrawing(NewPictures pictures, const FrameStats& stats)
@@ -66,8 +66,8 @@ class BoundDrawing {
 
     // Returns whether the device may still be drawing.
     virtual bool is_under_way() const { return false; }
-    // Keeps a Python object alive as long as this drawing: the inputs of the frame,
-    // which may be drawn again.
+    // Keeps a Python object alive as long as this drawing. It has the inputs of the
+    // frame, which may be drawn again.
     void keep(py::object kept) { kept_ = std::move(kept); }
     // Waits until the pictures are drawn.
     virtual const FrameStats& finish() { return stats_; }

@@ -1,6 +1,6 @@
 // The backend of the host, which is always compiled. Arrays are NumPy arrays, there are
-// no streams, and all work is done when a function returns. Its frames and pools are in
-// host_frame.cpp.
+// no streams, and all work is finished when a function returns. Its frames and pools
+// are in host_frame.cpp.
 
 #include "bindings/backend.h"
 #include "bindings/host_frame.h"
@@ -69,7 +69,8 @@ class HostTarget final : public backend::Target {
     std::unique_ptr<::v3dg::Model<float>> model_;
 };
 
-// row_alignment is 1: processors that run Python read float32 at any address.
+// row_alignment is 1, because processors that run Python can read float32 from any
+// address.
 constexpr BackendTraits kTraits{.host_reads_arrays = true,
                                 .computes_doubles = true,
                                 .row_alignment = 1,

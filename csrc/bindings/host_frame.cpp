@@ -15,19 +15,19 @@ namespace {
 
 // The kinds of frames of a pool. `flight` is a frame of a sequence. `first_look` and
 // `look` are steps of settling a view. `aside` draws with the pages that the last frame
-// used, and neither brings in pages nor requests any.
+// used; it neither brings in pages nor requests any.
 enum class PoolFrame { flight, first_look, look, aside };
 
 class HostPool final : public backend::Pool {
   public:
     explicit HostPool(PagePool& pool) : pool_(pool), pages_(pool), needs_(pool.num_bundles()) {}
 
-    // Draws a frame: brings in pages, calls cut(tables, rule, needs), and passes the
-    // page requests to the pool. cut() returns the tolerance that it used. Called
+    // Draws a frame. It brings in pages, calls cut(tables, rule, needs), and passes the
+    // page requests to the pool. cut() must return the tolerance that it used. Called
     // without the GIL.
     template <class Cut>
     NotedView frame(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
-        // In a child of fork(), `busy_` could be locked for ever.
+        // In a child of fork(), `busy_` could be locked forever.
         pool_.check_process();
         const MutexLock lock(busy_);
         if (kind == PoolFrame::first_look) pool_.begin_settling();
@@ -74,7 +74,7 @@ class HostPool final : public backend::Pool {
         return step;
     }
 
-    // Returns the gaussians of each bundle, with the colours that the request asks for.
+    // Returns the gaussians of each bundle, with the colours of the request.
     std::vector<SceneModel> models(const SceneState& scene, const FrameRequest& request) const {
         std::vector<SceneModel> models;
         for (size_t b = 0; b < scene.tables.size(); ++b) {
@@ -109,7 +109,7 @@ class HostPool final : public backend::Pool {
     HostPages pages_;
     Mutex busy_;
     bool has_begun_ V3DG_GUARDED_BY(busy_) = false;  // whether any frame has begun
-    // [page] per bundle
+    // [page] for each bundle
     std::vector<std::vector<uint32_t>> needs_ V3DG_GUARDED_BY(busy_);
 };
 
@@ -138,7 +138,7 @@ BatchStats stats_of(const std::vector<SceneFrameCounts>& counts) {
     return stats;
 }
 
-// A batch on the host, which is drawn when draw_batch() returns.
+// A batch on the host. It is finished when draw_batch() returns.
 class DrawnBatch final : public BoundBatch {
   public:
     explicit DrawnBatch(BatchStats stats) : stats_(std::move(stats)) {}
@@ -185,7 +185,7 @@ struct HostPictures {
     Span<const Picture<float>> span() const { return {pictures.data(), pictures.size()}; }
 };
 
-// The models of a frame. The object is immutable. A frame in progress keeps it, while
+// The models of a frame. The object is immutable. A frame in progress keeps it while
 // another thread sets new models.
 struct HostModels {
     std::vector<std::shared_ptr<const backend::Model>> models;
@@ -279,8 +279,8 @@ class HostFrame final : public backend::Frame {
     }
 
     // Calls body(scene, rule) without the GIL. The scene has the models that were set
-    // or, with a pool, the resident part of the pool. body() returns the tolerance that
-    // it used.
+    // or, with a pool, the resident part of the pool. body() must return the tolerance
+    // that it used.
     template <class Body>
     void with_scene(const backend::FrameInput& input, const SelectRule& rule, PoolFrame kind,
                     uint32_t* last_bin, const Body& body) const {

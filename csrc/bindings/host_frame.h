@@ -9,8 +9,8 @@
 
 namespace v3dg::host {
 
-// The gaussians that frames on the host read: either planes, which this object owns, or
-// the codes of a bundle, which it borrows.
+// The gaussians that frames on the host read. They are either planes, which this object
+// owns, or the codes of a bundle, which it borrows.
 class HostModel final : public backend::Model {
   public:
     explicit HostModel(const GaussianRows<const float>& rows);
@@ -51,7 +51,7 @@ std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const back
 
 std::unique_ptr<backend::RayFrame> make_ray_frame();
 
-// Makes an array like new_elements(), of zeros.
+// Like new_elements(), but sets all elements to zero.
 template <class T>
 T* zeros(const Shape& shape, py::object& object) {
     const NewArray<T> array(kHost, shape);

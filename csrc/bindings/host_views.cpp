@@ -21,7 +21,8 @@ class HostViewsTape final : public ViewsTape {
             models_.push_back(std::make_unique<::v3dg::Model<T>>(rows));
     }
 
-    // Each thread draws a view. All threads together draw the views that are left over.
+    // Each thread draws one view at a time. When fewer views than threads are left, all
+    // threads draw each of them together.
     void draw(T* color, T* alpha, T* depth, bool keeps_tape) {
         const size_t num_views = cameras_.size();
         const size_t first_left_over = num_views - num_views % most_threads();
@@ -54,7 +55,7 @@ class HostViewsTape final : public ViewsTape {
     }
 
   private:
-    // Rows of gradients that are summed over the views, for one view.
+    // Rows for the gradients of one view, before they are added to the sums over views.
     class Scratch {
       public:
         GaussianRows<T> cleared(const GaussianRows<T>& sums, const ViewsWanted& wanted) {
@@ -88,9 +89,9 @@ class HostViewsTape final : public ViewsTape {
         std::vector<T> values_;
     };
 
-    // Adds the gradients of all views in their order. If gaussians are few, each thread
-    // computes a view, whose rows are then added. All threads together compute the views
-    // that are left over.
+    // Adds the gradients of all views in their order. If there are few gaussians, each
+    // thread computes one view, whose rows are then added. When fewer views than
+    // threads are left, all threads compute each of them together.
     void add_views(const NewViewsGradients<T>& sums, const ViewsWanted& wanted,
                    const ViewsGradientPlanes<T>& planes) {
         constexpr size_t kMostScratchRows = size_t(1) << 21;
@@ -109,7 +110,8 @@ class HostViewsTape final : public ViewsTape {
             add_view(view, sums.rows, sums, wanted, planes);
     }
 
-    // Adds the gradients of a view to `rows`, and sets those that it alone has.
+    // Adds the gradients of a view to `rows`, and sets the gradients that only belong
+    // to this view.
     void add_view(size_t view, GaussianRows<T> rows, const NewViewsGradients<T>& sums,
                   const ViewsWanted& wanted, const ViewsGradientPlanes<T>& planes) const {
         const size_t skipped = view * rows.size;
@@ -140,7 +142,7 @@ class HostViewsTape final : public ViewsTape {
                 .appearance = {T(look_.filter_px2), look_.antialiased, false}};
     }
 
-    // Returns a picture without memory.
+    // Returns a picture whose memory is not set.
     Picture<T> picture_of(size_t view) const {
         const std::array<double, 3> background = look_.of_view(view).background;
         return {.window = {0, 0, static_cast<int>(width()), static_cast<int>(height())},

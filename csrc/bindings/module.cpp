@@ -1,5 +1,5 @@
-// The definition of the compiled module: what it requires of the process, then the
-// bindings of each part.
+// Defines the compiled module: first its requirements on the process, then the bindings
+// of each part.
 
 #ifdef _OPENMP
 #include <dlfcn.h>
@@ -17,11 +17,11 @@
 #include "residency/cluster_table.h"
 
 #ifdef _OPENMP
-// Ends the idle threads of GNU's OpenMP (libgomp) before a fork(). The child would have
-// no such threads, but would wait for them for ever. The next parallel loop starts new
-// threads, in the parent as in the child. LLVM's OpenMP, which may replace libgomp,
-// handles fork() itself. With LLVM's OpenMP, this call would wait for ever for locks
-// that LLVM's own fork handler holds.
+// Ends the idle threads of GNU's OpenMP (libgomp) before a fork(). The child would not
+// have these threads, but would wait for them forever. The next parallel loop starts
+// new threads, both in the parent and in the child. LLVM's OpenMP, which may replace
+// libgomp, handles fork() itself. With it, this call would wait forever for locks that
+// LLVM's own fork handler holds.
 static void let_threads_go() { omp_pause_resource_all(omp_pause_hard); }
 static bool must_let_threads_go() {
     Dl_info found;
@@ -35,9 +35,9 @@ static int num_cuda_devices() {
     return backend == nullptr ? 0 : backend->num_devices();
 }
 
-// Refuses objects that were made by `__new__` alone, which have no C++ value. When such
-// an object is passed to a function, pybind11 asks its class to allocate the value, and
-// would use it uninitialised.
+// Rejects objects that were only made by `__new__` and have no C++ value. When such an
+// object is passed to a function, pybind11 asks its class to allocate the value, and
+// would use it without initialising it.
 static void* refuse_unmade(size_t) {
     throw v3dg::py::type_error(
         "self: this object was made by __new__ alone and has no value; call the class instead");

@@ -2,8 +2,8 @@
 
 #include <pybind11/pybind11.h>
 
-// The functions that define the bindings, one per source file, in the order in which
-// module.cpp calls them.
+// The functions that define the bindings. There is one per source file, in the order in
+// which module.cpp calls them.
 
 namespace v3dg {
 

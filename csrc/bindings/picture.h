@@ -42,7 +42,7 @@ struct NewPicture {
     }
 };
 
-// The pictures of a frame: one for a camera, two for a stereo camera, left first.
+// The pictures of a frame: one for a camera, or two for a stereo camera, left first.
 using NewPictures = std::vector<NewPicture>;
 
 }  // namespace v3dg

@@ -11,9 +11,9 @@ namespace {
 
 namespace py = pybind11;
 
-// Serialises the registration of threads with Python. Registration uses state that the
-// interpreter destroys when it ends. `is_closed` becomes true before the interpreter
-// destroys that state, and ends registration.
+// Serialises the registration of threads with Python, which uses state that the
+// interpreter destroys when it ends. Before that, `is_closed` becomes true, and no more
+// threads are registered.
 struct Entrance {
     std::mutex busy;
     bool is_closed = false;
@@ -26,14 +26,14 @@ Entrance& entrance() {
 }
 
 void close_entrance() {
-    // A thread that holds the mutex may be waiting for the GIL.
+    // Release the GIL, because a thread that holds the mutex may be waiting for it.
     const Unlocked unlocked;
     const std::lock_guard<std::mutex> lock(entrance().busy);
     entrance().is_closed = true;
 }
 
-// Replaces the mutex in the child of a fork(), where the thread that held it does not
-// exist.
+// Replaces the mutex in the child of a fork(), in which the thread that locked it does
+// not exist.
 void renew_entrance() { new (&entrance().busy) std::mutex; }
 
 }  // namespace
@@ -46,8 +46,8 @@ bool call_with_lock(const std::function<void()>& body) {
         return !entrance().is_closed;
     });
     if (!is_open) return false;
-    // The lock is not released by a destructor: if Python ends the thread, the
-    // destructor would release a lock that the thread does not hold.
+    // A destructor must not unlock the mutex. If Python ends the thread, the destructor
+    // would unlock a mutex that the thread has not locked.
     try {
         staying_if_ended(body);
     } catch (...) {

@@ -6,8 +6,9 @@
 // Up to Python 3.13, a thread that requests the GIL while the interpreter ends is ended
 // by pthread_exit(), which unwinds its stack. Unwinding aborts the process at the first
 // function that must not throw, such as a destructor, and runs other destructors
-// without the GIL. Therefore such a thread never returns to this code: it sleeps until
-// the process ends, which does not wait for it. Python 3.14 and later do the same.
+// without the GIL. Therefore such a thread must never return to this code. Instead, it
+// sleeps until the process ends, which does not wait for it. Python 3.14 and later do
+// the same.
 
 #include <pybind11/pybind11.h>
 
@@ -51,11 +52,11 @@ class Unlocked {
     PyThreadState* thread_;
 };
 
-// Calls body() with the GIL, on a thread that Python did not start. Returns false,
-// without calling it, if the interpreter is ending or has ended.
+// Calls body() with the GIL, on a thread that Python did not start. If the interpreter
+// is ending or has ended, does not call it, and returns false.
 bool call_with_lock(const std::function<void()>& body);
 
-// Makes call_with_lock() refuse calls when the interpreter ends. Call this once, when
+// Makes call_with_lock() reject calls when the interpreter ends. Call this once, when
 // the module is loaded.
 void watch_end_of_python();
 

@@ -1,4 +1,4 @@
-// Models, palettes and scenes: they check arguments and call the backend.
+// Models, palettes and scenes. These classes check arguments and call the backend.
 
 #include "bindings/resident.h"
 

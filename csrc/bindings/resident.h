@@ -33,7 +33,8 @@ class BoundModel {
     size_t size_ = 0;
     bool is_coded_ = false;
     int sh_degree_ = 0;
-    std::vector<uint32_t> num_gaussians_;  // gaussians per cluster of a coded model
+    std::vector<uint32_t> num_gaussians_;  // number of gaussians in each cluster of a
+                                           // coded model
     std::shared_ptr<const backend::Model> model_;
 };
 
@@ -54,15 +55,16 @@ class BoundPalette {
 // in progress keeps the old one.
 struct SceneState {
     py::list bundles;
-    // Per instance: bundle, importance, positions, quaternions, scales, factors.
+    // The arrays of the instances: bundle, importance, positions, quaternions, scales,
+    // factors.
     py::tuple arrays;
     std::vector<ClusterTable> tables;
-    std::vector<size_t> num_gaussians;  // gaussians of each bundle
-    InstanceTable instances;            // has poses only if the host can read the arrays
+    std::vector<size_t> num_gaussians;  // number of gaussians of each bundle
+    InstanceTable instances;            // only has poses if the host can read the arrays
     std::shared_ptr<const Environments> environments =
         std::make_shared<Environments>(Span<const int32_t>{});
 
-    // The label of each instance; null: no instance has a label.
+    // The label of each instance, or null if no instance has one.
     std::shared_ptr<const std::vector<int32_t>> labels;
 
     Span<const int32_t> label_span() const {
@@ -81,7 +83,7 @@ class BoundScene {
     std::shared_ptr<const SceneState> state() const { return state_; }
     const backend::Scene& handle() const { return *scene_; }
 
-    // Replaces all bundles. The caller then sets the instances.
+    // Replaces all bundles. The caller must then set the instances.
     void set_bundles(const py::list& bundles);
     void set_instances(const py::array& bundle, const py::array& importance,
                        const py::object& positions, const py::object& quaternions,
@@ -91,10 +93,10 @@ class BoundScene {
     void set_poses(const py::object& positions, const py::object& quaternions,
                    const py::object& scales);
 
-    // `steps` is the state of a sequence of cuts; null for a single cut.
+    // `steps` is the state of a sequence of cuts, or null for a single cut.
     BoundCut select(const BoundEyes& camera, const SelectRule& rule, BudgetSteps* steps);
-    // Returns the priority of each page, (pages,) float32 for each bundle; 0 if the cut
-    // does not need the page. The scene must be on the host.
+    // Returns the priority of each page, (pages,) float32 for each bundle. It is 0 if
+    // the cut does not need the page. The scene must be on the host.
     py::list page_needs(const BoundCamera& camera, const SelectRule& rule) const;
 
   private:

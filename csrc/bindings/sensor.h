@@ -1,6 +1,6 @@
 #pragma once
 
-// Channels of pictures beside colour, and layers of meshes, for Python.
+// Channels of pictures other than colour, and layers of meshes, for Python.
 
 #include <optional>
 #include <string>
@@ -16,18 +16,19 @@ struct NewChannels {
     py::object median_depth = py::none(), normal = py::none(), instance = py::none(),
                label = py::none(), weight = py::none(), clipped = py::none();
 
-    // Allocates the arrays of channels that have none in `planes`, and returns the
-    // planes of all channels. `shape` is that of a plane: (H, W) or (B, H, W).
+    // Allocates the arrays of requested channels that `planes` lacks. Returns the
+    // planes of all channels. `shape` is the shape of a plane, (H, W) or (B, H, W).
     SensorPlanes allocate(Device device, const Channels& channels,
                           const std::vector<py::ssize_t>& shape, SensorPlanes planes = {});
 };
 
-// A layer of meshes: borrowed arrays of one picture (H, W) or of many (B, H, W).
+// A layer of meshes. It borrows the arrays of one picture (H, W) or of several (B, H,
+// W).
 class BoundMesh {
   public:
     // color: (..., 3). depth, coverage: (...). normal: (..., 3) or None. instance,
-    // label: (...) int32 or None. On a CUDA device, coverage may be None: 1 where the
-    // depth is positive and finite.
+    // label: (...) int32 or None. On a CUDA device, coverage may be None, which means 1
+    // where the depth is positive and finite.
     BoundMesh(py::object color, py::object depth, py::object coverage, py::object normal,
               py::object instance, py::object label, bool is_linear);
 

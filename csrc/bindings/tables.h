@@ -30,7 +30,7 @@ class BoundTable {
     // Returns the memory in bytes of the tables on a device.
     size_t bytes_on(int device) const;
 
-    // Returns the tables on a device. All scenes on the device share them; they are
+    // Returns the tables on a device. All scenes on the device share them. They are
     // created if no scene has them yet.
     std::shared_ptr<const backend::Tables> on(const Work& work) const;
 

@@ -14,8 +14,8 @@ struct Centers {
     bool sum, size;
 };
 
-// The gradients of a picture, as arrays on the device of the gaussians. None if not
-// requested.
+// The gradients of a picture, as arrays on the device of the gaussians. An array that
+// was not requested is None.
 struct Gradients {
     py::object means, quats, scales, opacities, sh, background;
     py::object centers = py::none();       // (N, 2) with respect to the centres, 1 / px
@@ -31,12 +31,13 @@ class Tape {
                                const py::object& d_depth, Centers wanted) = 0;
 };
 
-// The settings of a picture besides gaussians and camera.
+// The settings of a picture, in addition to gaussians and camera.
 struct DrawLook {
     double filter_px2;
     bool antialiased;
     std::array<double, 3> background;
-    bool plain_colors;  // use the coefficients (of degree 0) directly as colours
+    bool plain_colors;  // whether coefficients (of degree 0) are used directly as
+                        // colours
 
     template <class T>
     GaussianRows<const T> read(const Rows& gaussians) const {
@@ -46,10 +47,11 @@ struct DrawLook {
     }
 };
 
-// Throws ValueError unless gaussians have coefficients of degree 0, as plain colours do.
+// Throws ValueError unless gaussians have coefficients of degree 0 only, which plain
+// colours require.
 void check_plain_colors(const Rows& gaussians);
 
-// A drawn picture. `counts` are set on the host only; `tape` is null if not requested.
+// A picture. `counts` are only set on the host. `tape` is null if it was not requested.
 struct Rasterized {
     py::object color, alpha, depth;
     std::optional<RenderCounts> counts;
@@ -60,7 +62,7 @@ struct Rasterized {
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);
 
-// The gradient of one plane of a picture; zeros if it is None.
+// The gradient of one plane of a picture. None becomes zeros.
 template <class T>
 struct GradientPlane {
     py::object object;

@@ -13,7 +13,8 @@
 
 namespace v3dg {
 
-// A camera, for its whole image or a part, and the view matrix that it was made from.
+// A camera that draws its whole image or a part, and the view matrix that it was made
+// from.
 struct BoundCamera {
     std::array<double, 16> viewmat;
     Camera camera;
@@ -27,12 +28,12 @@ struct BoundEyes {
     Eyes eyes;
 };
 
-// Throws ValueError unless the rule's footprint is defined for the cameras: the paper's
-// is defined for one pinhole only.
+// Throws ValueError unless the rule's footprint is defined for the cameras. The paper's
+// footprint is only defined for one pinhole camera.
 void check_footprint(const Eyes& eyes, const SelectRule& rule);
 
-// The arrays of gaussians: all on the host or all on one CUDA device; float32 or, on
-// the host, float64.
+// The arrays of gaussians, either all on the host or all on one CUDA device. They are
+// float32 or, on the host, may be float64.
 class Rows {
   public:
     Rows(py::object means, py::object quats, py::object scales, py::object opacities,
@@ -44,7 +45,7 @@ class Rows {
     bool is_double() const { return is_double_; }
     const std::array<py::object, 5>& arrays() const { return arrays_; }
 
-    // Borrows the arrays, which must have the precision T.
+    // Borrows the arrays, whose precision must be T.
     template <class T>
     GaussianRows<const T> read() const {
         check_precision(std::is_same<T, double>::value);
@@ -117,7 +118,7 @@ class Instances {
     std::array<py::object, 6> arrays_;
     InstanceTable table_;
 };
-// Returns (I, 4) factors of red, green, blue and opacity; empty for None.
+// Returns (I, 4) factors of red, green, blue and opacity. None gives an empty span.
 Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count);
 void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles);
 
@@ -127,7 +128,7 @@ Span<const int64_t> offsets_of(const py::handle& offset, size_t last);
 // Throws ValueError unless the size of an image is valid.
 void check_image_size(int width, int height);
 
-// Returns the requested part of the camera's image.
+// Returns the part of the camera's image that is drawn.
 Window window_of(const Camera& camera);
 
 }  // namespace v3dg

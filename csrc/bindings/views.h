@@ -8,7 +8,7 @@
 
 namespace v3dg {
 
-// The requested gradients, besides those of all inputs.
+// The gradients that are requested, in addition to those of all inputs.
 struct ViewsWanted {
     Centers centers;
     bool poses;
@@ -21,16 +21,17 @@ struct ViewsWanted {
 class ViewsTape {
   public:
     virtual ~ViewsTape() = default;
-    // The centres of the result are (V, N, 2), the backgrounds (V, 3).
+    // In the result, centres are (V, N, 2), and backgrounds (V, 3).
     virtual Gradients backward(const py::object& d_color, const py::object& d_alpha,
                                const py::object& d_depth, const ViewsWanted& wanted) = 0;
 };
 
-// The settings of views besides gaussians and cameras.
+// The settings of views, in addition to gaussians and cameras.
 struct ViewsLook {
     double filter_px2;
     bool antialiased;
-    std::vector<std::array<double, 3>> backgrounds;  // one for all views, or one for each
+    std::vector<std::array<double, 3>> backgrounds;  // one element for all views, or
+                                                     // one for each
     bool plain_colors;                               // as in DrawLook
 
     DrawLook of_view(size_t view) const {
@@ -41,7 +42,7 @@ struct ViewsLook {
     }
 };
 
-// Drawn views: (V, H, W, ...). `tape` is null if not requested.
+// Views that were drawn: (V, H, W, ...). `tape` is null if it was not requested.
 struct RasterizedViews {
     py::object color, alpha, depth;
     std::unique_ptr<ViewsTape> tape;

@@ -1,8 +1,8 @@
-"""Make blender.jpg: a field of donuts and oaks, opened and rendered by the add-on.
+"""Makes blender.jpg: a field of donuts and oaks, opened and rendered by the add-on.
 
     blender/bin/python docs/images/make_blender.py donut.v3dg oak.v3dg blender.jpg
 
-Needs a Python with bpy 5.3, v3dg and what it depends on.
+The script needs a Python with bpy 5.3, and v3dg with its dependencies.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Makes fades.webp of the donut: a slow drift with a hard cut and with a fade, and
-below how errors change.
+"""Makes fades.webp of the donut: a slow drift with a hard cut and with a fade, and a
+plot of the changes of the error below them.
 
 python docs/images/make_fades.py donut.v3dg
 """
@@ -18,7 +18,8 @@ from v3dg.cleaning import ball_of_most
 from v3dg.pictures import contact_sheet, to_8bit
 
 SIDE, SCALE, FRAMES, GAIN = 160, 5, 48, 24.0
-WINDOW = slice(52, 108), slice(44, 116)  # that the object is in
+# rows and columns of the picture that contain the object
+WINDOW = slice(52, 108), slice(44, 116)
 
 
 def main(path: str) -> None:
@@ -51,7 +52,8 @@ def main(path: str) -> None:
 
 
 def enlarged(picture: np.ndarray) -> np.ndarray:
-    """The part with the object, as it is shown."""
+    """Return the enlarged part of a picture that contains the object, in 8-bit
+    colours."""
     pixels = Image.fromarray(to_8bit(picture[WINDOW]))
     size = SCALE * pixels.width, SCALE * pixels.height
     return np.asarray(pixels.resize(size, Image.Resampling.BICUBIC))

@@ -1,8 +1,8 @@
-"""Make the figures of docs/how_it_works.md and docs/choosing.md; needs the extra
-`bench`, takes a minute.
+"""Makes the figures of docs/how_it_works.md and docs/choosing.md. The script needs the
+extra `bench`, and takes a minute.
 
-The pictures are drawn by v3dg of an asset that is made here, the curves are those of
-recorded results.
+v3dg draws the pictures of an asset that the script generates. The curves are recorded
+results.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import numpy as np
 
 import v3dg
 
-sys.path.append(str(Path(__file__).resolve().parents[2]))  # for benchmarks/ of this checkout
+# to import benchmarks/ of this checkout
+sys.path.append(str(Path(__file__).resolve().parents[2]))
 from benchmarks.worlds.procedural import make_asset, place_field
 from v3dg.pictures import contact_sheet, to_8bit, write_picture
 from v3dg.select import DEFAULT_TOLERANCE
@@ -31,7 +32,7 @@ RESULTS = HERE.parent.parent / "benchmarks" / "results"
 LEVELS = (0, 2, 4, 6, 8)
 SIDE = 230
 SKY = (0.80, 0.86, 0.90)
-# Ink that can be read on the light and on the dark pages of the site.
+# Colours that are legible on the light and on the dark web pages of the site.
 INK, FINE, COARSE, OTHER = "#8a919c", "#2f9e6e", "#e08e2b", "#7d8fd6"
 STYLE = {
     "text.color": INK,
@@ -56,7 +57,8 @@ def main() -> None:
 
 
 def levels(bundle: v3dg.Bundle) -> None:
-    """Levels of one asset at one size, as they look and with a colour a cluster."""
+    """Draw the levels of one asset at one size, once with their own colours and once
+    with a colour per cluster."""
     camera = v3dg.Camera.look_at((1.6, -2.4, 1.5), (0, 0, 0.35), width=SIDE, height=SIDE)
     rows = []
     for color_by in ("appearance", "cluster"):
@@ -80,7 +82,8 @@ def levels(bundle: v3dg.Bundle) -> None:
 
 
 def cut(bundle: v3dg.Bundle) -> None:
-    """A field of instances, as it looks and with a colour a level."""
+    """Draw a field of instances, once with their own colours and once with a colour per
+    level."""
     scene = v3dg.Scene()
     positions, quaternions, scales = place_field(1500, seed=0)
     scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
@@ -104,7 +107,8 @@ def cut(bundle: v3dg.Bundle) -> None:
 
 
 def tree() -> None:
-    """Clusters of four levels over one asset, and the cut for a camera at its left."""
+    """Draw the clusters of four levels over one asset, and the cut for a camera at the
+    left."""
     figure, axes = plt.subplots(figsize=(7.6, 3.1))
     num_leaves, height = 8, 4
     drawn = {
@@ -112,7 +116,7 @@ def tree() -> None:
         (0, 1),
         (1, 1),
         (2, 1),
-    }  # (level, place): fine near the camera, coarse away from it
+    }  # (level, position): fine near the camera and coarse far from it
     for level in range(height):
         width = 2**level
         for place in range(num_leaves // width):
@@ -152,13 +156,13 @@ def tree() -> None:
 
 
 def tolerance() -> None:
-    """Time against error on the paper's DonutSea, as recorded on a GPU."""
+    """Plot time against error for the paper's DonutSea, as recorded on a GPU."""
     rows: list[dict[str, Any]] = json.loads((RESULTS / "full" / "tolerance.json").read_text())[
         "rows"
     ]
     figure, axes = plt.subplots(figsize=(6.4, 3.6))
-    # The curve is nearly level at its lowest point, so there the labels stand below it,
-    # elsewhere beside it.
+    # The curve is nearly horizontal at its lowest point, so labels are below it there,
+    # and beside it elsewhere.
     beside = {
         0.5: (12, -8),
         1: (10, -8),

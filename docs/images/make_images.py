@@ -1,5 +1,5 @@
-"""Make donutsea.jpg: a window of a layout as truth, with all gaussians and with our cut
-twice."""
+"""Makes donutsea.jpg: a window of a layout as reference picture, with all gaussians,
+and with two of our cuts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Config:
     output: Path
     camera: int = 59
     window: tuple[int, int, int, int] = (800, 380, 360, 270)
-    """Left, top, width and height in px."""
+    """Left, top, width and height of the window in px."""
     zoom: int = 2
     tolerances: tuple[float, float] = (3.0, 8.0)
 

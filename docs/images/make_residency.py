@@ -1,10 +1,10 @@
-"""Make viewer_residency.jpg: the viewer just after a teleport, with pages that are not
-there yet.
+"""Makes viewer_residency.jpg: the viewer just after a teleport, when pages are still
+missing.
 
 python docs/images/make_residency.py donut.v3dg FOLDER
 
-The scene is a field of a hundred copies of the bundle, in files of their own in FOLDER,
-as in `benchmarks.studies.residency`. Needs playwright.
+The scene is a field of a hundred copies of the bundle, which are separate files in
+FOLDER, as in `benchmarks.studies.residency`. The script needs playwright.
 """
 
 import shutil
@@ -22,15 +22,16 @@ from v3dg.viewer.frame import Frame, SceneView
 from v3dg.viewer.server import Site
 from v3dg.viewer.view import View
 
-sys.path.append(str(Path(__file__).resolve().parents[2]))  # for benchmarks/ of this checkout
+# to import benchmarks/ of this checkout
+sys.path.append(str(Path(__file__).resolve().parents[2]))
 from benchmarks.studies.residency.measure import Config, Field, write_copies
 
 WIDTH, HEIGHT, PANEL = 1120, 640, 300
 
 
 class HeldView(SceneView):
-    """Draws the first picture from ``eye`` at full size, and none on the way there or
-    after it."""
+    """A view that draws only the first picture from ``eye`` at full size, and no
+    picture before or after it."""
 
     eye: np.ndarray | None = None
     last: Frame

@@ -1,5 +1,5 @@
-"""Make viewer_*.jpg: the viewer in Chromium, in each mode, and at the size of a phone.
-Needs playwright.
+"""Makes viewer_*.jpg: the viewer in Chromium, in each mode, and at the size of a phone.
+The script needs playwright.
 
 python docs/images/make_viewer.py donutsea.json 048_camera_8
 """
@@ -94,7 +94,7 @@ def look_through(page: Page, camera: str) -> None:
 
 
 def settle(page: Page) -> None:
-    """Until the picture is there in full."""
+    """Wait until the picture is complete."""
     page.wait_for_timeout(1000)
     page.wait_for_selector("body[data-state=ready]", timeout=300_000)
     page.wait_for_timeout(300)
@@ -112,7 +112,7 @@ def shown(page: Page) -> Image.Image:
 
 
 def sheet(pictures: list[Image.Image], names: list[str], columns: int) -> Image.Image:
-    """The pictures in rows, with their names on them."""
+    """Return the pictures in rows, labelled with their names."""
     width, height = pictures[0].size
     rows = -(-len(pictures) // columns)
     whole = Image.new("RGB", (columns * width + 6 * (columns - 1), rows * height + 6 * (rows - 1)))
@@ -132,7 +132,7 @@ def sheet(pictures: list[Image.Image], names: list[str], columns: int) -> Image.
 
 
 def save(name: str, picture: Image.Image) -> None:
-    """At most 150 kB."""
+    """Save a picture in a file of at most 150 kB."""
     path = FOLDER / f"viewer_{name}.jpg"
     for quality in (86, 78, 70, 60, 50):
         picture.convert("RGB").save(path, quality=quality, optimize=True)

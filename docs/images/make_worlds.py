@@ -1,4 +1,5 @@
-"""Make worlds.jpg: the assets and the worlds of benchmarks/worlds, each from near."""
+"""Makes worlds.jpg: the assets and the worlds of benchmarks/worlds, each seen from
+near."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from PIL import Image
 
 import v3dg
 
-sys.path.append(str(Path(__file__).resolve().parents[2]))  # for benchmarks/ of this checkout
+# to import benchmarks/ of this checkout
+sys.path.append(str(Path(__file__).resolve().parents[2]))
 from benchmarks import worlds
 from benchmarks.worlds import procedural
 from v3dg.metrics import box_downsample
@@ -21,14 +23,15 @@ from v3dg.pictures import to_8bit
 
 BACKGROUND = (0.70, 0.78, 0.84)
 WIDTH, HEIGHT = 352, 264
-# Maker, and from where to look: azimuth, elevation, distance, target.
+# The functions that make assets, each with its view: azimuth, elevation, distance and
+# target.
 ASSETS: list[tuple[Any, tuple[float, float, float, tuple[float, float, float]]]] = [
     (procedural.make_donut, (0.4, 0.65, 0.40, (0, 0, 0))),
     (lambda: procedural.make_tree(kind="maple"), (0.6, 0.12, 14.5, (0, 0, 3.9))),
     (lambda: procedural.make_temple(700_000), (0.55, 0.20, 46, (0, 0, 4.6))),
     (lambda: procedural.make_person(seed=2), (0.35, 0.10, 2.1, (0, 0, 1.33))),
 ]
-# World, its arguments, camera.
+# For each picture: the world, its arguments, and the camera.
 WORLDS: list[tuple[str, dict[str, int], str]] = [
     ("donut_sea", {"instances": 500, "num_gaussians": 20_000}, "053_camera_13"),
     ("forest", {"instances": 60, "num_gaussians": 60_000}, "032_camera_12"),
@@ -47,7 +50,7 @@ def main(config: Config) -> None:
     below = []
     for name, arguments, camera in WORLDS:
         world = worlds.WORLDS[name](**arguments)
-        # Level 0 is drawn, so the levels need no fit.
+        # Only level 0 is drawn, so coarser levels need no fit.
         build = v3dg.BuildConfig(steps=0)
         bundles = {
             key: v3dg.build_bundle(asset.make(), config=build, progress=False, quality="draft")

@@ -1,4 +1,4 @@
-"""Runs a short part of each attack in fuzz/attack.py. That program itself runs for any
+"""Runs each attack of fuzz/attack.py for a short time. That program itself runs for any
 length of time."""
 
 import json

@@ -1,9 +1,6 @@
 """Small files that claim or expand to much. The memory of readers stays below the
 limits in docs/robustness.md. A separate process reads each file within a minute, and
 the system measures its peak memory.
-
-Each is read by a process of its own, whose largest memory the system measures, and
-which has a minute.
 """
 
 import gzip
@@ -54,7 +51,8 @@ WARM_UP = [FIXTURES / name for name in ("sh3.ply", "sh3.sog", "sh3_v3.spz", "sh3
 
 
 def read_apart(path):
-    """Return the bytes of memory that reading a file took, and the outcome."""
+    """Read a file in a separate process; return the bytes of memory that this took, and
+    the outcome."""
     done = subprocess.run(
         [sys.executable, "-c", CHILD, path, *WARM_UP],
         capture_output=True,
@@ -67,7 +65,8 @@ def read_apart(path):
 
 
 def equal_gaussians(count, degree=0):
-    """Return equal gaussians, whose file is as small as a file of so many can be."""
+    """Return equal gaussians, because their file is as small as a file of so many
+    gaussians can be."""
     one = Gaussians(
         np.ones((1, 3), np.float32),
         np.array([[1, 0, 0, 0]], np.float32),
@@ -395,7 +394,7 @@ READ = ["splat: zeros", "ksplat: a high degree without gaussians", "spz: many st
 
 def assert_bounded(path, num_bytes):
     peak, found = read_apart(path)
-    # docs/robustness.md has figures for these files.
+    # the limit in docs/robustness.md
     print(f"{num_bytes:,} bytes, {peak >> 20} MiB, {found}")
     believed = FREE_GAUSSIANS + num_bytes
     count = int(found.split()[1]) if found.startswith("read") else 0
@@ -492,7 +491,7 @@ def test_equal_gaussians_read_back_however_many(tmp_path, name, degree):
 
 @pytest.mark.parametrize("part", ["means", "quats", "scales", "opacities", "sh"])
 def test_one_constant_picture_is_read(tmp_path, part):
-    """Point clouds and captures of other programs have such pictures."""
+    """Files of point clouds and captures by other programs contain such pictures."""
     rng = np.random.default_rng(0)
     asset = equal_gaussians(70_000, 1)
     for other in {"means", "quats", "scales", "opacities", "sh"} - {part}:

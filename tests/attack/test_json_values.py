@@ -1,9 +1,6 @@
 """Every value in the JSON of every kind of file is replaced by values of other types.
 Each changed file is read, or its reader refuses it with a ValueError of one line that
 begins with the file's name.
-
-Each file is then read, or refused with the ValueError of its reader, in one line that
-begins with the file.
 """
 
 import copy
@@ -21,7 +18,8 @@ from gltf_files import file_of_every_part
 from random_bundle import random_gaussians
 from v3dg._json import is_one_line
 
-LONG = "a number of 5,000 digits"  # stands for an exchanged value
+# placeholder for a value that JSON writes with 5,000 digits
+LONG = "a number of 5,000 digits"
 ODD = [[], [26], [[]], [None], {}, {"a": 1}, None, True, False, "", "a", "0", "\x1b[31m", LONG]
 ODD += [
     0,
@@ -181,7 +179,8 @@ def kind(request, tmp_path):
     return json_kind(tmp_path, good, read)
 
 
-@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")  # read_both reads notes
+# read_both also reads data that cause warnings
+@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")
 def test_every_value_of_another_kind_is_named(kind):
     faults = []
     for document, change in variants(kind.document):

@@ -4,12 +4,6 @@ SUPERSPLAT_VIEWER is the folder `public` of `npm install
 @playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file `build/playcanvas.min.mjs` of
 `npm install playcanvas@2.23.3`, and CESIUM the folder `Build/Cesium` of `npm install
 cesium@1.145.0`.
-
-They need playwright, Chromium where PATH finds it, and what environment variables name:
-SUPERSPLAT_VIEWER the folder `public` of `npm install
-@playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file `build/playcanvas.min.mjs` of
-`npm install playcanvas@2.23.3`, CESIUM the folder `Build/Cesium` of `npm install
-cesium@1.145.0`.
 """
 
 import functools
@@ -81,8 +75,8 @@ needs_engine = pytest.mark.skipif(
 
 
 def seen(browser, server, options=""):
-    """Return the picture (H, W, 3) of the viewer once it no longer changes, and the
-    levels whose files it requested."""
+    """Wait until the viewer's picture no longer changes. Return it (H, W, 3), and the
+    levels whose files were requested."""
     errors = []
     server.asked.clear()
     page = browser.new_page(viewport={"width": SIDE, "height": SIDE})
@@ -120,7 +114,7 @@ def wanted(bundle, server):
         "initial"
     ]
     # The viewer's y axis points up, and it shows -y of an asset as up. The asset was
-    # turned so that z is up.
+    # rotated so that z is up.
     back = np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]])
     eye, target = (back @ np.array(pose[name]) for name in ("position", "target"))
     fov = np.radians(pose["fov"])
@@ -199,8 +193,9 @@ def test_the_page_of_a_scene_keeps_its_budget(browser, server, town, budget):
     assert 0.9 * budget < drawn <= budget
 
 
-# Widths and heights in CSS px, by which the page chooses levels, and device pixels per
-# CSS px. The desktop has few, because software draws them.
+# Widths and heights in CSS px, which determine the levels that the web page chooses,
+# and device pixels per CSS px. The desktop has few device pixels, because software
+# draws them.
 SIZES = {"desktop": (1920, 1080, 0.1), "phone": (390, 844, 3)}
 BUDGET = 20_000
 
@@ -231,7 +226,8 @@ def crowd(server, bundle):
 
 
 class WatchedPage:
-    """One of our pages, with the number of gaussians that each of its frames drew."""
+    """One of our web pages, with the number of gaussians that each of its frames
+    drew."""
 
     RECORD = """
         window.frames_drawn = [];
@@ -319,7 +315,7 @@ def test_the_budget_holds_in_movement(watched):
         watched.page.keyboard.up(key)
     assert 0.8 * BUDGET < watched.settled() <= BUDGET
     drawn = watched.drawn()
-    assert len(set(drawn)) > 5  # the camera did move
+    assert len(set(drawn)) > 5  # otherwise the camera did not move
     assert max(drawn) <= BUDGET
 
 
@@ -334,8 +330,8 @@ def test_a_budget_that_changes_holds(watched):
 
 @pytest.mark.skipif(CESIUM is None, reason="CESIUM does not name its folder")
 def test_cesium_shows_tiles_and_fewer_from_far(browser, server, bundle):
-    """From near, it shows the tiles of the asset itself, one for each group of level
-    1."""
+    """Seen from near, CesiumJS shows the tiles of the asset itself, one for each group
+    of level 1."""
     write_tiles(bundle, server.folder / "tiles", up="z")
     (server.folder / "tiles" / "cesium").symlink_to(CESIUM)
     picture, near = settled(browser, server, "tiles/index.html?distance=1.2")

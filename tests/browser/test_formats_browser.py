@@ -4,12 +4,6 @@ NODE_MODULES. This is the folder that `npm install playcanvas@2.23.3 three@0.187
 @sparkjsdev/spark@2.2.0 babylonjs@9.28.0 babylonjs-loaders@9.28.0 @adobe/spz@0.2.2
 fflate@0.8.3` creates. If SCREENSHOTS names a folder, the pictures of the engines and
 ours are saved there.
-
-They need playwright, Chromium where PATH finds it, and the environment variable
-NODE_MODULES, which names the folder that `npm install playcanvas@2.23.3 three@0.187.0
-@sparkjsdev/spark@2.2.0 babylonjs@9.28.0 babylonjs-loaders@9.28.0 @adobe/spz@0.2.2
-fflate@0.8.3` makes. With SCREENSHOTS, the name of a folder, the pictures are left
-there, ours beside them.
 """
 
 import dataclasses
@@ -43,9 +37,9 @@ pytestmark = [
 ]
 
 SIDE, FOV = 300, 40
-EYE = (0.18, -0.38, 0.30)  # axis of the donut that points up
+EYE = (0.18, -0.38, 0.30)  # z of the donut points up
 UP = (0.0, 0.0, 1.0)
-# The axes of files whose asset is turned; z is up in the donut.
+# The axes of the formats in which assets are rotated. In the donut, z is up.
 AXES = {".spz": _axes.OPENGL, ".glb": _axes.GLTF}
 
 # Each page looks from EYE at the origin with UP up, and counts its pictures since the
@@ -142,7 +136,7 @@ engine.runRenderLoop(() => { scene.render(); window.frames_shown++; });
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves files and logs nothing."""
+    """A web server of files that logs nothing."""
 
     def log_message(self, *_):
         pass

@@ -1,5 +1,5 @@
-"""The viewer is used in Chromium as a person uses it. The tests need playwright, and
-Chromium on PATH."""
+"""Uses the viewer in Chromium as a person does. The tests need playwright, and Chromium
+on PATH."""
 
 import base64
 import io
@@ -58,7 +58,7 @@ def site(tmp_path_factory):
 
 
 class Tab:
-    """A tab of the browser: what can be seen in it, and actions of a user."""
+    """A browser tab with the viewer: what can be seen in it, and actions of a user."""
 
     def __init__(self, browser, url, size=(900, 600), **options):
         self.errors = []
@@ -81,8 +81,8 @@ class Tab:
         return float(cell.inner_text().split()[0].replace(",", ""))
 
     def settled(self):
-        """Return the picture as 8-bit values once it is drawn in full and the page says
-        so."""
+        """Wait until the picture is drawn in full and the page reports this. Return its
+        8-bit values."""
         self.page.wait_for_timeout(300)  # waits until earlier actions were sent
         self.page.wait_for_selector("body[data-state=ready]", timeout=1000 * SECONDS)
         self.page.wait_for_timeout(300)  # waits until the browser has drawn it
@@ -116,7 +116,7 @@ class Tab:
         self.page.locator("#panel summary", has_text=folder).click()
 
     def set(self, slider, value):
-        """Set the value of a slider, as its keys do."""
+        """Set the value of a slider in the same way as its keys."""
         self.page.get_by_role("slider", name=slider, exact=True).evaluate(
             "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", value
         )
@@ -152,7 +152,8 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
     selected = tab.figure("selected")
     tab.set("Tolerance px²", 32)
     coarse = tab.settled()
-    # Near the asset, most of the picture is fine detail.
+    # Near the asset, most of the picture shows fine detail, so few gaussians are
+    # selected.
     assert tab.figure("selected") < 0.9 * selected
     assert differ(turned, coarse) > 0.001
 
@@ -184,7 +185,7 @@ def test_page_asks_what_is_up_where_that_is_assumed(browser, site):
             group.get_by_role("button").click()
             tab.page.wait_for_selector(question, state="hidden")
             link = tab.page.url
-        with Tab(browser, link) as tab:  # declares which way is up
+        with Tab(browser, link) as tab:  # this asset declares its up axis
             tab.settled()
             assert tab.page.locator(question).count() == 0
     finally:
@@ -195,8 +196,8 @@ def test_page_asks_what_is_up_where_that_is_assumed(browser, site):
 
 
 def test_drag_is_answered_while_the_mouse_is_still_down(tab):
-    """First the existing picture is moved, and then drafts follow, which are marked as
-    such."""
+    """First the existing picture is moved. Then drafts follow, which are marked as
+    drafts."""
     first = tab.settled()
     tab.page.mouse.move(200, 400)
     tab.page.mouse.down()
@@ -214,16 +215,16 @@ def test_drag_is_answered_while_the_mouse_is_still_down(tab):
 
 
 def test_moved_picture_is_nearly_the_one_that_follows(browser, site):
-    """Both show the asset from the same place, turned. They are compared where both
-    have content."""
+    """The moved picture and the next picture show the asset from the same position.
+    They are compared where both have content."""
     with Tab(browser, site.url) as tab:
         tab.settled()
         tab.page.get_by_role("radio", name="Fly").click()
         first = tab.settled()
         tab.page.evaluate("viewer.connection.send = () => {}")  # so that no further picture arrives
         tab.drag((200, 300), (260, 300))
-        # Where the browser takes long for a frame, the picture follows the camera less
-        # often.
+        # If the browser needs a long time for a frame, the picture follows the camera
+        # less often.
         tab.page.wait_for_timeout(300)
         moved = tab.seen()
         assert differ(first, moved) > 0.02
@@ -439,7 +440,8 @@ def test_a_link_that_asks_for_what_is_not_there_is_told_so(browser, site):
         assert "mode residency is not there" in tab.page.inner_text("#notices")
         view = tab.view()
         assert "show" not in view
-        assert float(view["split"]) == 0.5  # only a pool splits the memory
+        # the memory is divided only if there is a pool
+        assert float(view["split"]) == 0.5
 
 
 def test_bookmarks_outlive_the_page_and_lead_back(tab):

@@ -1,11 +1,7 @@
-"""A page of another site learns nothing about the viewer in Chromium, not even the size
-of a picture. The tests need playwright, and Chromium on PATH. The other page has
-another port, and either the viewer's host name, which the browser treats as the same
-site, or another name, which is a cross site.
-
-Needs playwright, and Chromium where PATH finds it. The other page is at another port,
-under the viewer's name (the browser calls that the same site) and under another one (a
-cross site).
+"""A web page of another site learns nothing about the viewer in Chromium, not even the
+size of a picture. The tests need playwright, and Chromium on PATH. The other page has
+another port. It has either the viewer's host name, which the browser treats as the same
+site, or another host name, which the browser treats as a different site.
 """
 
 import http.server
@@ -108,7 +104,7 @@ def site(tmp_path_factory):
 
 
 class Blank(http.server.BaseHTTPRequestHandler):
-    """A page of another site. The tests provide its scripts."""
+    """A web page of another site. The tests provide its scripts."""
 
     def do_GET(self):
         body = b"<!doctype html><title>other</title><body>"
@@ -134,8 +130,8 @@ def other_port():
 
 @pytest.fixture(params=["127.0.0.1", "localhost"])
 def other(browser, other_port, request):
-    """Yield a page of the same site, and one of another site; the viewer is opened as
-    127.0.0.1."""
+    """Yield a web page of the same site, and one of another site. The viewer is opened
+    as 127.0.0.1."""
     page = browser.new_page()
     page.goto(f"http://{request.param}:{other_port}/")
     yield page
@@ -155,7 +151,7 @@ def test_another_page_learns_nothing_by_another_name_of_this_machine(other, site
 
 
 def test_the_viewers_own_page_has_all_of_it(browser, site):
-    """This shows that the probes above work."""
+    """This shows that the probes find something where they are allowed to."""
     page = browser.new_page()
     page.goto(site.url)
     learned = page.evaluate(PROBES, f"{site.url}/")

@@ -1,5 +1,5 @@
-"""The page of `write_web_page` streams a scene and draws it as `v3dg.render` does. See
-test_web_renderer.py for what the tests need."""
+"""The web page of `write_web_page` streams a scene and draws it as `v3dg.render` does.
+See test_web_renderer.py for what the tests need."""
 
 import json
 import time
@@ -63,7 +63,7 @@ def site(scene, tmp_path):
 
 
 class Tab:
-    """A page of a site in Chromium."""
+    """A browser tab in Chromium that shows the web page."""
 
     def __init__(self, browser, url):
         self.page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
@@ -271,7 +271,7 @@ def test_a_damaged_bundle_is_left_out_with_a_line(site, open_tab, damage, expect
 
 
 def test_tables_that_contradict_each_other_are_refused(site, open_tab):
-    """Also if their hash is correct, as in a hostile file."""
+    """They are refused even if their hash is correct, as in a malicious file."""
     path = min(site.glob("*.v3dg"))
     data = bytearray(path.read_bytes())
     header, start = web_pages.header_of(data)

@@ -1,4 +1,4 @@
-"""The steps of .ci/run, the jobs that use them, and the summary of durations."""
+"""Tests the steps of .ci/run, the jobs that use them, and the summary of durations."""
 
 import re
 import subprocess
@@ -117,6 +117,6 @@ def test_wheels_are_not_begun_for_what_is_no_python():
 
 
 def test_wheels_are_tried_by_the_command_of_cibuildwheel():
-    """`.ci/wheels` finds the line with sed, so it has to keep its form."""
+    """`.ci/wheels` finds the line with sed, so the line has to keep its form."""
     settings = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     assert re.search(r'^test-command = "v3dg demo [^"]*"$', settings, re.MULTILINE)

@@ -1,9 +1,6 @@
 """Every block of code in the README and in docs/ runs, with small files instead of
 large ones. A comment before a block tells what it needs: <!-- test: gpu -->, <!-- test:
 needs MODULE -->, or <!-- test: skip, REASON -->.
-
-A comment before a block says what else it takes: <!-- test: gpu -->, <!-- test: needs
-MODULE -->, or <!-- test: skip, REASON -->.
 """
 
 import json
@@ -36,7 +33,7 @@ BLOCK = re.compile(
 @dataclass
 class Block:
     page: str
-    line: int  # line number in the page of the first line of code
+    line: int  # line number, in the file, of the block's first line of code
     kind: str
     code: str
     how: list[str]  # words of the comment before the block

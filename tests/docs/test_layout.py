@@ -1,4 +1,7 @@
-"""The source tree keeps its layout. Failures name what is missing or not listed."""
+"""Tests that the source tree keeps its layout.
+
+Failures name what is missing or not listed.
+"""
 
 import ast
 import os
@@ -115,7 +118,7 @@ NOT_OPERATIONS = {
 }
 TESTED_WITH = {"tile_bin": "rasterize"}
 KINDS = {"unit", "files", "system", "browser", "attack", "docs"}
-# Operations whose CPU and CUDA parts still have one contract each.
+# Operations whose CPU and CUDA parts still have separate contracts.
 TWO_CONTRACTS = {"project", "select"}
 MOST_LINES_WITHOUT_A_HEAD = 100
 MOST_COLUMNS_OF_A_COMMENT = 88
@@ -148,7 +151,8 @@ def test_cmake_lists_every_source_once():
         "CUDA_DECISION_SOURCES",
         "CUDA_SOURCES",
     )
-    sources = [source for source in SOURCES if not source.startswith("csrc/wasm/")]  # build.py
+    # its sources are listed in build.py
+    sources = [source for source in SOURCES if not source.startswith("csrc/wasm/")]
     assert sorted(source for name in lists for source in cmake_list(f"V3DG_{name}")) == sources
 
 
@@ -310,15 +314,15 @@ def test_only_the_backend_of_cuda_sees_cuda():
 
 
 def test_kernels_are_started_by_launch_alone():
-    """This function checks that a kernel starts, and sets the shared memory that it
-    needs."""
+    """Only `launch` may start kernels, because it checks that a kernel starts and sets
+    the shared memory that it needs."""
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".cu", ".cuh"} and p.name != "launch.cuh"]
     assert [str(p) for p in sources if "<<<" in p.read_text(encoding="utf-8")] == []
 
 
 def test_bindings_give_pythons_lock_up_by_a_type_of_ours():
-    """With the type of pybind11, a thread that is ended by Python aborts the process
-    (bindings/python_lock.h)."""
+    """Bindings release Python's lock by our own type. With the type of pybind11, a
+    thread that Python ends aborts the process (bindings/python_lock.h)."""
     pythons = re.compile(r"gil_scoped|PyEval_\w+Thread|PyGILState_Ensure|Py_BEGIN_ALLOW_THREADS")
     users = [
         p.name
@@ -337,7 +341,9 @@ def imports_of(path, *, inside_functions):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            names |= {node.module} - {"v3dg"}  # a package from which modules are imported, too
+            # a package whose modules are imported, and which is therefore not imported
+            # itself
+            names |= {node.module} - {"v3dg"}
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             todo += node.orelse
@@ -361,7 +367,8 @@ def rooms_imported(path, rooms):
     for name in imports_of(path, inside_functions=True):
         if name.split(".")[0] == "v3dg":
             room = room_of(name)
-            yield room if room in rooms else "__init__"  # contains the public names
+            # the package itself contains the public names
+            yield room if room in rooms else "__init__"
 
 
 def order_of_v3dg():
@@ -441,8 +448,8 @@ def test_extras_are_told_by_the_names_that_pip_has():
 
 
 def test_every_result_is_named():
-    """A page names it, or a program reads it. Results that nothing names are not
-    read."""
+    """Every recorded result is named in a page of the docs or read by a program;
+    otherwise nobody would read it."""
     pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]
     programs = [*(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.md")]
     text = "\n".join(path.read_text(encoding="utf-8") for path in (*pages, *programs))

@@ -1,13 +1,13 @@
 """Limits for the shape of the code in v3dg/, counted in its syntax tree; the counts may
 only fall.
 
-A limit on the total of lines can be met by packing, which makes code harder to read.
-Each of these counts falls only when code is unpacked. `LIMITS` holds what each package
-counts today: a count above its limit fails, and so does one that is well below, so that
-the limit is lowered.
+A limit on the number of lines can be met by packing code, which makes it harder to
+read. Each of these counts only falls if code is unpacked. `LIMITS` has the present
+counts of each package. The test fails if a count is above its limit, and also if it is
+well below, so that the limit is lowered.
 
-`python tests/docs/test_shape.py` prints the counts of all packages, and with files as
-arguments each place.
+`python tests/docs/test_shape.py` prints the counts of all packages. With files as
+arguments, it prints each counted place.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ TOP = "v3dg"
 MOST_LINES_A_FUNCTION = 40
 MOST_POSITIONAL = 6
 
-# Words that relate the parts of a phrase and do not say what a value is. Away from the
-# line that binds it, such a name tells nothing, and no search finds it. Words that also
-# name a thing are left out where they have that meaning here: `left` and `right`
+# Words that relate the parts of a phrase and do not say what a value is. Such a name
+# says nothing away from the line that binds it, and a search does not find it. Words
+# that also name a thing are left out if they have that meaning here: `left` and `right`
 # (sides), `now` (a time), `first`, `last`, `start` and `end` (positions).
 _PREPOSITIONS_AND_ADVERBS = """
     of by at in to from for with without over under above below about around after before behind

@@ -59,7 +59,7 @@ def test_files_keep_it(tmp_path, name, antialiased):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_files_say_nothing_where_nothing_is_known(tmp_path, name):
-    """A `.spz` file always has a bit for it, which is 0 then."""
+    """The header of a `.spz` file always has a bit for antialiasing. It is 0 here."""
     v3dg.write_asset(tmp_path / name, ASSET)
     assert declared(tmp_path / name) is (False if name == "a.spz" else None)
 
@@ -216,8 +216,8 @@ CAMERA = v3dg.Camera.look_at((0, -20, 0), (0, 0, 0), width=48, height=48, fov_x=
 
 
 def test_an_asset_is_drawn_as_it_was_trained(tmp_path):
-    """From afar, a filter without compensation would make it thicker, and without a
-    filter it would flicker."""
+    """Seen from far away, a filter without compensation would make the asset thicker,
+    and without a filter it would flicker."""
     asset = ASSET.trained(antialiased=True)
     v3dg.write_asset(tmp_path / "a.ply", asset)
     asset = v3dg.read_asset(tmp_path / "a.ply")
@@ -296,8 +296,8 @@ def test_files_that_have_axes_declare_all_together(tmp_path):
 
 
 def test_leaves_on_disk_keep_it(tmp_path):
-    """An asset that is sorted on disk has no gaussians in memory that could record
-    it."""
+    """An asset that is sorted on disk has no object in memory that could record the
+    antialiasing."""
     v3dg.write_asset(tmp_path / "a.ply", ASSET, antialiased=True)
     for most_in_memory in (len(ASSET), 10):
         with leaves_on_disk(

@@ -1,4 +1,5 @@
-"""The up axis survives every file: assets are rotated to the axes of files and back."""
+"""Every format keeps the up axis: assets are rotated to the axes of the format and
+back."""
 
 import gzip
 import itertools
@@ -22,8 +23,7 @@ from v3dg.rotations import normalised, rotation_from_quaternion
 from v3dg.upright import direction_of, up_of
 
 LETTERS = ("LR", "UD", "BF")
-# Numbers in the extension SPZ_ADOBE_coordinate_system of version 4 of Niantic's
-# library.
+# Values of the extension SPZ_ADOBE_coordinate_system in version 4 of Niantic's library.
 RECORDS = [
     *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
@@ -97,7 +97,7 @@ def test_what_is_up_is_up_in_axes_of_that_name(up):
 @pytest.mark.parametrize("up", AXES)
 @pytest.mark.parametrize("suffix", [".glb", ".spz", ".usda"])
 def test_what_is_up_stands_up_in_files_that_have_axes(tmp_path, asset, suffix, up):
-    """The raw numbers in the file have +y up, whatever was up before."""
+    """In the stored positions, +y is up, whatever was up before."""
     if suffix == ".usda":
         pytest.importorskip("pxr")
     path = tmp_path / f"a{suffix}"
@@ -181,7 +181,8 @@ def test_spz_with_an_unknown_number_of_axes_is_refused(tmp_path, asset):
 
 
 def outdoors(rng, count=3000, ground=0.4):
-    """Return (N, 3) a wide ground at height 0 with things above it; z is up."""
+    """Return the means (N, 3) of a wide ground at height 0 with things above it; z is
+    up."""
     num_ground = int(ground * count)
     plane = rng.uniform(-10, 10, (num_ground, 2))
     things = rng.normal(0, 3, (count - num_ground, 2))
@@ -204,8 +205,8 @@ def standing(means):
 
 
 def write_without_record(path, asset):
-    """Write a `.spz` file like most programs: the numbers in memory, without a record
-    of the axes."""
+    """Write a `.spz` file like most programs: positions as they are in memory, without
+    a record of the axes."""
     write_asset(path, half_turn(asset, "x"))
     content = bytearray(gzip.decompress(path.read_bytes()))[:-12]
     content[14] = 0

@@ -76,14 +76,14 @@ def saved(tmp_path, request):
 
 
 class Reads:
-    """Counts the bytes that any part of this process reads."""
+    """Counts the bytes that this process reads."""
 
     def __init__(self):
         self.num_bytes = 0
 
     def _look(self):
-        """Return the system's count, and the bytes that reading this count adds to
-        it."""
+        """Return the count of the operating system, and the number of bytes that
+        reading this count adds to it."""
         text = Path("/proc/self/io").read_text()
         return int(re.search(r"^rchar: (\d+)$", text, re.MULTILINE)[1]), len(text)
 
@@ -177,7 +177,7 @@ def test_official_reader_sees_the_same(tmp_path_factory, bundle):
         pages = file.get_slice("pages")
         places = [*file.get_tensor("pages.offset").tolist(), pages.get_shape()[0]]
         for page, (first, end) in enumerate(itertools.pairwise(places)):
-            if first < end:  # it cannot slice an empty tensor
+            if first < end:  # an empty tensor cannot be sliced
                 content = page_content(bundle, page)
                 assert pages[first:end].tobytes() == content + bytes(end - first - len(content))
 
@@ -270,7 +270,8 @@ def test_opened_gaussians_can_be_written(saved):
 
 
 def test_tables_cannot_be_changed_after_they_were_checked(saved):
-    """Drawing relies on the tables: a wrong offset would read any memory."""
+    """Drawing trusts the tables: a wrong offset would read outside the bundle's
+    memory."""
     bundle, path = saved
     built = v3dg.build_bundle(
         bundle.level_gaussians(0), config=v3dg.BuildConfig(steps=0), progress=False
@@ -509,7 +510,7 @@ def test_a_page_that_the_system_cannot_read_is_named(saved, tmp_path):
         opened.read_page(0)
 
 
-# Hostile files.
+# Malicious files.
 
 
 @pytest.mark.parametrize(
@@ -816,7 +817,8 @@ def test_golden_files_of_all_versions_are_read(version, codec, tmp_path):
 def test_damage_of_tables_is_found_in_all_versions(version, codec, tmp_path):
     data = bytearray(golden_bundles.path_of(version, codec).read_bytes())
     path = tmp_path / "damaged.v3dg"
-    for place in (len(data) - 1, len(data) - 17):  # of the hash of the file, and of a page's hash
+    # one byte of the file's hash, and one of a page's hash
+    for place in (len(data) - 1, len(data) - 17):
         data[place] ^= 1
         path.write_bytes(data)
         with pytest.raises(ValueError, match="hash: does not match the header and the tables"):
@@ -866,7 +868,8 @@ def test_unknown_codecs_ask_for_an_update(tmp_path):
 @settings(max_examples=80)
 @given(data=st.data())
 def test_random_pages_are_finite_gaussians_or_refused(tmp_path_factory, data):
-    """Their hashes are correct, as if the writer intended this content."""
+    """The hashes are computed after the change, as if the writer intended this
+    content."""
     path = tmp_path_factory.mktemp("pages") / "small.v3dg"
     bundle = random_bundle(3, sh_degree=data.draw(st.integers(0, 3)), codec="quantized")
     bundle.write(path)
@@ -898,7 +901,7 @@ def test_random_pages_are_finite_gaussians_or_refused(tmp_path_factory, data):
 
 
 class Stop(BaseException):
-    """Stands for any interruption of a write, such as Ctrl-C."""
+    """Simulates any interruption of a write, such as Ctrl-C."""
 
 
 def test_an_interrupted_save_changes_nothing(saved, monkeypatch):
@@ -938,7 +941,8 @@ def test_a_full_disk_is_named_and_leaves_nothing(saved, monkeypatch):
 
 
 def test_a_half_written_file_is_refused_and_replaced(saved):
-    """After a power failure another file remains, which is never read as a bundle."""
+    """After a power failure, a temporary file remains, which is never read as a
+    bundle."""
     bundle, path = saved
     leftover = path.with_name(".small.v3dg.0123456789abcdef.tmp")
     leftover.write_bytes(path.read_bytes()[:-100])
@@ -1043,7 +1047,7 @@ def test_a_ball_that_barely_sticks_out_is_refused():
 
 def test_config_that_no_reader_would_accept_is_refused(saved):
     bundle, path = saved
-    # The config alone is within the limit, but the header is not.
+    # The config alone is within the limit for headers, but the whole header is not.
     large = Bundle(
         bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * ((1 << 20) - 100)}
     )

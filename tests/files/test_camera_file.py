@@ -32,8 +32,8 @@ CAPTURE = {
         {"file_path": "images/frame_2.png", "transform_matrix": MATRIX, "fl_x": 600, "w": 320.0},
     ],
 }
-# In the synthetic scenes of NeRF, the size is that of the pictures, whose files are not
-# read here.
+# For NeRF's synthetic scenes, the image size is read from the pictures, which are
+# missing here.
 SYNTHETIC = {
     "camera_angle_x": 0.69,
     "frames": [
@@ -84,7 +84,8 @@ def test_vertical_field_of_view_is_used(tmp_path):
 
 def test_applied_transform_is_undone_on_request(tmp_path):
     path = put(tmp_path, {**CAPTURE, "applied_scale": 2})
-    point = np.array([0.3, -0.2, 0.7])  # the place of the data before it was moved
+    # where the point was before the dataset was moved
+    point = np.array([0.3, -0.2, 0.7])
     in_file = 2 * np.array(CAPTURE["applied_transform"]) @ [*point, 1]
     kept = next(iter(read_cameras(path).values()))
     undone = next(iter(read_cameras(path, applied_transform="undo").values()))

@@ -105,7 +105,7 @@ def test_no_name_makes_a_camera_vanish(tmp_path, kind, text):
     rng = np.random.default_rng(0)
     wanted = {name: random_camera(rng) for name in NAMES[kind]}
     write_model(tmp_path / "a", wanted, text=text)
-    if text:  # this format cannot store spaces before a name
+    if text:  # the text format cannot store names that begin with spaces
         wanted = {name.lstrip(): camera for name, camera in wanted.items()}
     assert_same(read_cameras(tmp_path / "a"), wanted)
 
@@ -202,8 +202,9 @@ def assert_maps_as_colmap(camera, theirs):
 
 
 def test_all_models_of_colmap_are_known(tmp_path):
-    """COLMAP itself says which models are pinholes, how many parameters they have, when
-    they have no distortion, and where they project points."""
+    """COLMAP's library provides the expected values: which models are pinholes, how
+    many parameters they have, when they have no distortion, and where they project
+    points."""
     for name, kind in pycolmap.CameraModelId.__members__.items():
         if name == "INVALID":
             continue
@@ -221,8 +222,8 @@ def test_all_models_of_colmap_are_known(tmp_path):
             place.mkdir()
             model.write_binary(os.fspath(place))
             is_pinhole = theirs.is_perspective_pinhole()
-            # COLMAP calls every EUCM camera distorted, even if its parameters are those
-            # of a pinhole.
+            # COLMAP considers every EUCM camera distorted, even if its parameters are
+            # those of a pinhole.
             is_plain = theirs.is_undistorted() or (name == "EUCM" and not theirs.params[4])
             if is_pinhole:
                 assert len(read_cameras(place, distortion="ignore")) == 1
@@ -315,8 +316,8 @@ def test_models_that_claim_too_much_are_refused(tmp_path, cameras):
         path.write_bytes(good)
 
 
-# nerfstudio 1.1 writes the settings of a run in this form: YAML with Python objects,
-# followed by many more.
+# nerfstudio 1.1 writes the settings of a run in this form: YAML with Python objects.
+# Most of the settings are left out here.
 CONFIG = """\
 !!python/object:nerfstudio.engine.trainer.TrainerConfig
 _target: !!python/name:nerfstudio.engine.trainer.Trainer ''
@@ -361,12 +362,13 @@ def test_a_run_has_its_cameras_where_its_gaussians_are(trained, monkeypatch, tmp
     assert_same(read_cameras(run), wanted)
     assert_same(read_cameras(run / "config.yml"), wanted)
     (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")  # the data is also found from the run
+    # the dataset is found from the path of the run
+    monkeypatch.chdir(tmp_path / "elsewhere")
     assert_same(read_cameras(run), wanted)
 
 
 def test_what_was_applied_to_the_data_is_not_applied_twice(trained, tmp_path):
-    """The transform of the run already includes it."""
+    """The transform of the run already includes the transform of the dataset."""
     run, wanted = trained
     path = tmp_path / "data" / "poster" / "transforms.json"
     document = json.loads(path.read_text())
@@ -429,8 +431,8 @@ def test_the_viewer_offers_the_cameras_of_a_folder(tmp_path, monkeypatch, camera
 
 
 def test_a_folder_of_frames_is_read(tmp_path, trained):
-    """The transform of a training is beside it, so the cameras are in the frame of that
-    training."""
+    """The transform of a training is a file in the same folder, so the cameras are in
+    the frame of that training."""
     run, wanted = trained
     folder = tmp_path / "data" / "poster"
     plain = read_cameras(folder / "transforms.json")

@@ -114,8 +114,9 @@ def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
             errors.add(chunk, level.transform(scale=scale))
     first, second = errors.of_chunk[0], errors.of_chunk[1]
     assert first[0] == 0
-    assert first[1] < 1e-6  # pictures are stored rounded
-    # Dropping every second gaussian is worse than a level with as many.
+    assert first[1] < 1e-6  # pictures are rounded when they are stored
+    # Dropping every second gaussian causes a larger error than a level with as many
+    # gaussians.
     assert 0 < 2 * first[2] < first[3] == first[4]
     np.testing.assert_allclose(first, second, rtol=1e-3)
 
@@ -135,7 +136,9 @@ def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
     assert index["counts"][-1] == len(leaves)
     if chunk == 10**9:
         assert len(leaves) == 1
-    else:  # half of the chunk would suffice, or the tree would have been cut higher
+    # either half of the chunk would suffice for this, or the tree should have been
+    # divided higher up
+    else:
         assert max(leaf["lods"]["0"]["count"] for leaf in leaves) > chunk / 2 - 1
 
 
@@ -148,7 +151,8 @@ def test_the_finest_level_of_an_export_loads(tmp_path, bundle):
 
 
 def test_the_folder_of_an_export_is_an_asset(tmp_path, bundle):
-    """As its index is, in Python and in commands, which name it after the folder."""
+    """The folder is accepted in the same places as its index, in Python and in
+    commands. The commands name their outputs after the folder."""
     write_streamed_sog(bundle, tmp_path / "web", chunk=250)
     loaded = v3dg.read_asset(tmp_path / "web")
     wanted = v3dg.read_asset(tmp_path / "web" / "lod-meta.json")
@@ -320,7 +324,7 @@ def test_an_earlier_export_is_replaced_and_kept_on_failure(tmp_path, bundle, mon
 def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):
     write_streamed_sog(bundle, tmp_path / "web")
     pose = json.loads((tmp_path / "web" / "settings.json").read_text())["cameras"][0]["initial"]
-    turn = np.diag([-1.0, -1.0, 1.0])  # of the asset in the viewer
+    turn = np.diag([-1.0, -1.0, 1.0])  # the rotation of the asset in the viewer
     position, target = (turn @ pose[name] for name in ("position", "target"))
     means = bundle.level_gaussians(0).means
     camera = v3dg.Camera.look_at(
@@ -402,7 +406,7 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
 
 
 def test_info_of_an_export_has_the_size_of_all_its_files(tmp_path, bundle):
-    """The size counts every level and the environment once each. The page's settings
+    """The size includes every level and the environment once each. The page's settings
     are not part of the asset."""
     path = edited(tmp_path, bundle, environment="3_0/meta.json")
     num_bytes = sum(file.stat().st_size for file in (tmp_path / "web").rglob("*.*"))

@@ -183,7 +183,7 @@ def test_a_file_that_was_changed_since_is_not_lost(tmp_path, bundle):
     ):
         write_site(bundle, folder)
     assert contents(folder) == before
-    write_streamed_sog(bundle, folder)  # has no page
+    write_streamed_sog(bundle, folder)  # this function writes no web page
     assert (folder / "index.html").read_text() == "my page"
     write_site(bundle, folder, overwrite=True)
     assert "my page" not in (folder / "index.html").read_text()
@@ -396,8 +396,8 @@ def test_an_export_that_fails_as_it_takes_its_place_is_whole_or_gone(
 
 
 def test_an_export_goes_back_where_one_before_was_killed(tmp_path, bundle, monkeypatch):
-    """The export is killed at every move, and the next one fails; then the folder has
-    the whole content of one of the two."""
+    """The export is killed at every rename, and the next export fails. The folder then
+    has the whole content of one of the two exports."""
     earlier, later = two_exports(tmp_path, bundle)
     moment, was_killed = 0, True
     while was_killed:
@@ -500,7 +500,7 @@ def test_names_become_distinct():
 def test_usd_has_each_bundle_once_where_names_clash(tmp_path):
     pytest.importorskip("pxr")
     scene = v3dg.Scene()
-    for number in (1, 2):  # names of prims never begin with a digit
+    for number in (1, 2):  # names of USD prims cannot begin with a digit
         random_bundle(number).write(tmp_path / f"{number}a.v3dg")
         scene.add(v3dg.Bundle.open(tmp_path / f"{number}a.v3dg"), positions=[[0, 0, 0]])
     v3dg.write_usd(scene, tmp_path / "a.usda")
@@ -543,7 +543,7 @@ def test_a_folder_that_may_not_be_written_to_is_named(tmp_path, bundle, write):
 
 
 def test_an_export_is_recorded_whole(tmp_path, bundle):
-    """The record has every file that was written, with its size, and every folder."""
+    """The record lists every file that was written, with its size, and every folder."""
     write_site(bundle, tmp_path / "web")
     record = json.loads((tmp_path / "web" / RECORD).read_text())
     found = without(contents(tmp_path / "web"), RECORD)

@@ -61,7 +61,7 @@ def test_a_scene_has_its_instances_and_cameras(place):
     for name in ("positions", "quaternions", "scales", "importance"):
         np.testing.assert_allclose(found[name], getattr(scene, name).ravel(), rtol=1e-8)
     for name in ("rotation", "camera_rotation"):
-        # Z becomes y.
+        # The site has y up, so z becomes y.
         np.testing.assert_allclose(np.array(site[name]).T @ [0, 0, 1], [0, 1, 0], atol=1e-12)
     view, camera = site["cameras"][0], cameras["gate"]
     assert view["name"] == "gate"
@@ -76,8 +76,8 @@ def test_a_scene_has_its_instances_and_cameras(place):
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_what_is_up_is_up_in_the_page(place, up):
-    """The files of a single bundle are rotated so that y is down, and the page rotates
-    them further."""
+    """In the files of a single bundle y points down; the web page rotates them so that
+    y points up."""
     bundle = v3dg.Bundle.open("a b1.v3dg")
     write_site(bundle, "site", up=up)
     written = v3dg.read_asset("site/lod-meta.json").means @ np.array(
@@ -118,7 +118,8 @@ def test_the_engine_is_brought_from_npm_and_kept(place):
     bundle = v3dg.Bundle.open("a b1.v3dg")
     assert write_site(bundle, "site").has_engine
     (build / "playcanvas.min.mjs").unlink()
-    assert write_site(bundle, "site", chunk=10**6).has_engine  # of the export that it replaces
+    # the engine of the export that this one replaces
+    assert write_site(bundle, "site", chunk=10**6).has_engine
     assert (place / "site/playcanvas.min.mjs").read_text() == "engine"
 
 

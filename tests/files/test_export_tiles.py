@@ -38,7 +38,8 @@ def assert_inside(points, tile):
 def upright(gaussians):
     """Return the means of a tile's content, whose y is up, in the tile's frame, whose z
     is up."""
-    in_file = gaussians.means * [-1, -1, 1]  # reading a `.glb` rotates them by half a turn about z
+    # reading a `.glb` rotates the gaussians by half a turn about z
+    in_file = gaussians.means * [-1, -1, 1]
     return in_file[:, [0, 2, 1]] * [1, -1, 1]
 
 
@@ -86,8 +87,8 @@ def test_tiles_hold_what_is_below_them(tmp_path, bundle):
 
 
 def test_a_tile_is_replaced_where_selection_would_replace_its_group(tmp_path, bundle):
-    """A screen-space error of 16 px corresponds to the tolerance of 3 px² at the same
-    distance."""
+    """At the same distance, a screen-space error of 16 px corresponds to the tolerance
+    of 3 px²."""
     write_tiles(bundle, tmp_path / "tiles")
     groups = bundle.groups
     found = {
@@ -96,7 +97,8 @@ def test_a_tile_is_replaced_where_selection_would_replace_its_group(tmp_path, bu
         if tile.get("content", {}).get("uri", "0").split("_")[0] not in ("0", "asset.glb")
     }
     for g, error in found.items():
-        focal, distance = 900.0, 1e4  # so far that the solid angle of a ball is that of a disc
+        # so far away that the solid angle of a ball equals that of a disc
+        focal, distance = 900.0, 1e4
         footprint = math.pi * (groups.ball[g, 3] * focal / distance) ** 2 * groups.weight[g]
         assert (error * focal / distance / 16) ** 2 == pytest.approx(footprint / 3, rel=1e-5)
 
@@ -110,7 +112,7 @@ def test_a_scene_is_a_tile_an_instance(tmp_path):
     assert (done.bundles, done.instances) == (2, 3)
     assert done.tiles == sum(1 for _ in (tmp_path / "a/b").rglob("*.glb"))
     root = json.loads((tmp_path / "a/b/tileset.json").read_text())["root"]
-    # Z is up.
+    # A tileset without rotation: z is up.
     np.testing.assert_allclose(np.reshape(root["transform"], (4, 4)), np.eye(4), atol=1e-12)
     assert len(root["children"]) == 3
     for i, tile in enumerate(root["children"]):
@@ -124,8 +126,8 @@ def test_a_scene_is_a_tile_an_instance(tmp_path):
 
 
 def test_the_page_frames_the_finest_level(tmp_path):
-    """The coarse gaussians reach far beyond it: if the page framed them, the asset
-    would be tiny in the first view."""
+    """The coarse gaussians reach far beyond the finest ones. If the web page framed
+    them, the asset would be tiny in the first view."""
     bundle = random_bundle(3, num_levels=4)
     scene = v3dg.Scene()
     scene.add(bundle, [[5, 0, 0], [0, 9, 1]], [1, 0, 0, 0], [2, 1])

@@ -1,5 +1,4 @@
-"""The effect of all writers on existing files and links; test_malformed.py tests
-failures."""
+"""How all writers treat existing files and links. test_malformed.py tests failures."""
 
 import os
 import stat

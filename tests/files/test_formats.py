@@ -1,8 +1,8 @@
-"""Files of other programs: what other people's tools wrote and read, and what a hostile
-file can do to us.
+"""Files of other programs: those that other tools wrote, those that they read, and
+malicious ones.
 
-Who wrote the fixtures, and how, is in fixtures/README.md.
-What all readers share is in test_malformed.py.
+fixtures/README.md says how the fixtures were made. Tests that apply to all readers are
+in test_malformed.py.
 """
 
 import gzip
@@ -40,14 +40,14 @@ QUAT = 3 * np.sqrt(2)
 
 def spz_bounds(sh_bits_1=8, sh_bits_rest=8):
     return {
-        "means": 0.5 * 2**-12,  # 12 bits after the binary point
+        "means": 0.5 * 2**-12,  # fixed point with 12 fractional bits
         "log_scales": 0.5 / 16,  # multiples of 1/16
         # 9 bits and a sign for values up to sqrt(1/2)
         "quats": QUAT * 0.5 * np.sqrt(0.5) / 511 * 1.01,
         "opacities": 0.5 / 255,
-        "color": 0.5 / 255 / 0.15,  # a byte for 1 / 0.15
-        # A byte for -1 to 1. Its lower bits may be dropped: rounded to the nearest
-        # value or, at the end of the range, to the last one below.
+        "color": 0.5 / 255 / 0.15,  # one byte covers the range 1 / 0.15
+        # One byte for the range -1 to 1. Its lower bits may be dropped. Values are
+        # rounded to the nearest or, at the end of the range, down to the last one.
         "band 1": (0.5 * 2.0 ** (8 - sh_bits_1) + 1) / 128,
         "higher": (0.5 * 2.0 ** (8 - sh_bits_rest) + 1) / 128,
     }
@@ -60,10 +60,11 @@ def compressed_ply_bounds(reference):
         # 10 bits for y and 11 for x and z, over the extent of a chunk
         "means": extent * 0.5 / 1023,
         "log_scales": np.ptp(np.log(reference.scales)) * 0.5 / 1023,
-        "quats": QUAT * np.sqrt(2) * 0.5 / 1023 * 1.01,  # 10 bits for -sqrt(1/2) to sqrt(1/2)
+        # 10 bits for the range -sqrt(1/2) to sqrt(1/2)
+        "quats": QUAT * np.sqrt(2) * 0.5 / 1023 * 1.01,
         "opacities": 0.5 / 255,
         "color": color * 0.5 / 255,
-        "band 1": 0.5 * 8 / 256,  # a byte for -4 to 4
+        "band 1": 0.5 * 8 / 256,  # one byte for the range -4 to 4
         "higher": 0.5 * 8 / 256,
     }
 
@@ -80,7 +81,8 @@ def sog_bounds(reference):
         / 65535
         * (1 + np.abs(reference.means).max()),
         "log_scales": np.ptp(np.log(reference.scales)) * step,
-        "quats": QUAT * np.sqrt(2) / 255 * 1.02,  # a byte, truncated, for -sqrt(1/2) to sqrt(1/2)
+        # one byte for the range -sqrt(1/2) to sqrt(1/2), truncated
+        "quats": QUAT * np.sqrt(2) / 255 * 1.02,
         "opacities": 1.001 / 255,  # truncated
         "color": np.ptp(reference.sh[:, 0]) * step,
         "band 1": np.ptp(reference.sh[:, 1:]) * step if reference.sh_degree else 0,
@@ -91,13 +93,13 @@ def sog_bounds(reference):
 SPLAT_BOUNDS = {
     "means": 0,
     "log_scales": 1e-6,  # the writer computes exp in float32
-    "quats": QUAT / 128,  # a byte, truncated, for -1 to 1
+    "quats": QUAT / 128,  # one byte for the range -1 to 1, truncated
     "opacities": 1.001 / 255,  # truncated
-    "color": 1.001 / 255 / SH_C0,  # truncated, of colours between black and white
+    "color": 1.001 / 255 / SH_C0,  # truncated; colours are between black and white
 }
 
 KSPLAT_HALF = {
-    "means": 2.5 / 32767 * 0.51,  # 16 bits for a bucket with side 5
+    "means": 2.5 / 32767 * 0.51,  # 16 bits for a bucket with a side of 5
     "log_scales": 2**-10,  # half precision
     "quats": 2**-11,
     "opacities": SPLAT_BOUNDS["opacities"],
@@ -106,7 +108,8 @@ KSPLAT_HALF = {
     "higher": 0.4 * 2**-10,
 }
 
-# Formats that v3dg writes. Bytes of SOG are then rounded to the nearest.
+# Bounds for files that v3dg writes. For SOG, bytes are then rounded to the nearest
+# value.
 WRITTEN = {
     ".compressed.ply": compressed_ply_bounds,
     ".spz": lambda _: spz_bounds(),
@@ -116,8 +119,8 @@ WRITTEN = {
     ".glb": lambda _: {},
 }
 
-# A file, the asset from which it was made, and its bounds; fixtures/README.md names the
-# writers.
+# Each entry: a file, the asset from which it was made, and the error bounds.
+# fixtures/README.md says which program wrote it.
 FOREIGN = {
     "sh0.compressed.ply": compressed_ply_bounds,
     "sh3.compressed.ply": compressed_ply_bounds,
@@ -147,8 +150,7 @@ def reference_of(name):
 
 
 def in_order_of(reference, gaussians):
-    """Return for each gaussian of the reference the nearest gaussian, in the order of
-    the reference."""
+    """Return, for each gaussian of the reference, the gaussian nearest to it."""
     squared = np.square(reference.means[:, None].astype(float) - gaussians.means).sum(axis=2)
     nearest = squared.argmin(axis=1)
     assert len(set(nearest)) == len(reference) == len(gaussians)
@@ -180,7 +182,7 @@ def largest_errors(gaussians, reference):
 def assert_within(gaussians, reference, bounds):
     assert gaussians.sh_degree == reference.sh_degree
     for name, error in largest_errors(gaussians, reference).items():
-        # To this is added the rounding of float32 for values up to 8.
+        # Rounding float32 values of up to 8 adds to the bound.
         assert error <= bounds.get(name, 0) + 1e-6, name
 
 
@@ -194,7 +196,8 @@ def test_what_other_tools_write_is_read(name):
     gaussians = in_order_of(reference, read_asset(FIXTURES / name))
     if name.endswith("splat"):
         sh = np.ascontiguousarray(reference.sh[:, : gaussians.sh.shape[1]])
-        sh[:, 0] = np.clip(sh[:, 0], -0.5 / SH_C0, 0.5 / SH_C0)  # between black and white
+        # the format clamps colours to black and white
+        sh[:, 0] = np.clip(sh[:, 0], -0.5 / SH_C0, 0.5 / SH_C0)
         reference = Gaussians(
             reference.means, reference.quats, reference.scales, reference.opacities, sh
         )
@@ -213,7 +216,7 @@ def test_what_is_written_reads_back(tmp_path, suffix, degree):
     write_asset(path, reference)
     assert_within(in_order_of(reference, read_asset(path)), reference, WRITTEN[suffix](reference))
     numbers = 4 * (11 + 3 * sh.shape[1]) if suffix == ".glb" else 20 + 3 * sh.shape[1]
-    assert path.stat().st_size < 64 * numbers + 17_000  # tables of SOG
+    assert path.stat().st_size < 64 * numbers + 17_000  # plus the tables of SOG
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -223,7 +226,8 @@ def test_every_version_of_spz_reads_back(tmp_path, version, degree):
     write_asset(tmp_path / "a.spz", reference, version=version)
     start = (tmp_path / "a.spz").read_bytes()
     assert (gzip.decompress(start) if version < 4 else start)[4] == version
-    bounds = spz_bounds() | ({"quats": 0.1} if version == 2 else {})  # where w is nearly 0
+    # errors are larger where w is nearly 0
+    bounds = spz_bounds() | ({"quats": 0.1} if version == 2 else {})
     assert_within(read_asset(tmp_path / "a.spz"), reference, bounds)
     for wrong, path in ((5, "a.spz"), (3, "a.sog")):
         with pytest.raises(ValueError, match=rf"version: expected .*, got {wrong}"):
@@ -241,7 +245,8 @@ def test_gsply_reads_version_2_of_spz(tmp_path):
 
 
 def test_degree_4_of_spz_is_read_up_to_degree_3(tmp_path):
-    """The library of the format knows degree 4: 24 coefficients after the first."""
+    """The format's own library supports degree 4, which has 24 coefficients after the
+    first one."""
     content = bytearray(gzip.decompress((FIXTURES / "sh3_v3.spz").read_bytes()))
     count = int.from_bytes(content[8:12], "little")
     content[12] = 4
@@ -258,9 +263,10 @@ def test_degree_4_of_spz_is_read_up_to_degree_3(tmp_path):
 
 
 def test_rotations_of_spz_version_2_are_as_close_as_their_bytes_allow(tmp_path):
-    """A search of all bytes within 3 of the components, 343 for each of 65,536 random
-    rotations, leaves 6.4 degrees at most and 0.70 on average; rounding leaves 11.7 and
-    1.1. What the command says is measured from the file."""
+    """Searching all bytes within 3 of each component (343 combinations) for each of
+    65,536 random rotations leaves errors of at most 6.4 degrees, 0.70 on average.
+    Rounding leaves 11.7 and 1.1. The command reports an error that is measured from the
+    file."""
     rng = np.random.default_rng(0)
     quats = rng.normal(size=(5000, 4))
     asset = Gaussians(
@@ -278,7 +284,8 @@ def test_rotations_of_spz_version_2_are_as_close_as_their_bytes_allow(tmp_path):
     assert degrees.mean() < 0.76
     assert losses.rotation_error == pytest.approx(degrees.max(), rel=1e-3)
     assert f"rotations {degrees.max():.2g}°" in losses.lines[-1]
-    # From another axis, rotations are read with half turns about their own axes.
+    # If the up axis differs, rotations are read with half turns about the gaussians'
+    # own axes.
     newer = write_measured(tmp_path / "b.spz", asset, up="z")
     assert newer.rotation_error < 0.25
 
@@ -311,7 +318,7 @@ def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
         **{name: np.ascontiguousarray(array, np.float32) for name, array in values.items()}
     )
     bounds = WRITTEN[suffix](reference)
-    # It changes opacities of 0 and 1 by 1e-6.
+    # gsply changes opacities of 0 and 1 by 1e-6.
     assert_within(
         in_order_of(reference, found), reference, bounds | {"opacities": bounds["opacities"] + 1e-6}
     )
@@ -500,7 +507,7 @@ def test_chunks_without_colours_mean_black_to_white(tmp_path):
 
 
 def spz_of_version(version, asset, fraction_bits=12):
-    """Return a file of a version that no tool writes any more, by Niantic's
+    """Return a file in a version that no tool writes any more, made from Niantic's
     description."""
     num = len(asset)
     positions = (
@@ -847,8 +854,8 @@ def test_hostile_compressed_ply_is_refused(tmp_path, case):
 
 
 def test_glb_of_splat_transform_has_the_numbers_of_its_ply():
-    """It rotates assets to the axes of glTF by half a turn about z, and also the
-    gaussians' own axes."""
+    """splat-transform rotates assets, and the gaussians' own axes, to the axes of glTF
+    by half a turn about z."""
     reference = read_asset(FIXTURES / "sh3.ply")
     own_axes_turned = np.ascontiguousarray(reference.quats[:, [3, 2, 1, 0]]) * np.float32(
         [-1, 1, -1, 1]
@@ -860,7 +867,7 @@ def test_glb_of_splat_transform_has_the_numbers_of_its_ply():
 
 
 def test_a_glb_says_that_its_views_are_of_vertices(tmp_path):
-    """glTF-Validator requires it."""
+    """glTF-Validator requires the target of the buffer views."""
     write_asset(tmp_path / "a.glb", read_asset(FIXTURES / "sh3.ply"))
     content = (tmp_path / "a.glb").read_bytes()
     document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
@@ -868,7 +875,8 @@ def test_a_glb_says_that_its_views_are_of_vertices(tmp_path):
 
 
 def glb(change):
-    """Return the fixture after a function changed its JSON, or another its bytes."""
+    """Return the fixture after one function changed its JSON, or another one changed
+    its bytes."""
     content = (FIXTURES / "sh3.glb").read_bytes()
     size = int.from_bytes(content[12:16], "little")
     document = json.loads(content[20 : 20 + size])
@@ -1014,7 +1022,7 @@ def test_hostile_hier_is_refused(tmp_path, case):
 
 
 @settings(max_examples=300)
-# This file name in a zip is not UTF-8.
+# With this change, a file name in the zip is not UTF-8.
 @example(name="sh3.sog", edits=[(230, 128)], in_header=True)
 @pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")
 @given(
@@ -1070,7 +1078,7 @@ def gsplat_tensors(asset):
 def assert_same(gaussians, asset):
     for name in ("means", "sh"):
         np.testing.assert_array_equal(getattr(gaussians, name), getattr(asset, name))
-    # The bound is that of the logarithm in float32.
+    # The bound is the rounding of the logarithm in float32.
     np.testing.assert_allclose(gaussians.scales, asset.scales, rtol=8e-7)
     np.testing.assert_allclose(gaussians.opacities, asset.opacities, atol=1e-6)
     np.testing.assert_allclose(gaussians.quats, unit(asset.quats), atol=2e-7)
@@ -1103,7 +1111,7 @@ def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
         "scalers": {},
     }
     asset = replace(asset, means=tensors["means"].numpy())
-    if degree == 0:  # the model of splatfacto then stores logits of colours, see its `shs_0`
+    if degree == 0:  # splatfacto then stores logits of colours; see its `shs_0`
         colors = 1 / (1 + np.exp(-asset.sh.astype(np.float64)))
         asset = replace(asset, sh=((colors - 0.5) / SH_C0).astype(np.float32))
     torch.save(content, tmp_path / "step-000029999.ckpt")
@@ -1149,7 +1157,7 @@ def test_colours_of_a_gsplat_with_appearance_are_those_without_it(tmp_path):
 
 
 class Captured(torch.nn.Module):
-    """What the code of the 3DGS paper saves; 2DGS stores two scales."""
+    """The attributes that the code of the 3DGS paper saves. 2DGS stores two scales."""
 
     def __init__(self, asset, num_scales):
         super().__init__()
@@ -1388,8 +1396,8 @@ def test_a_checkpoint_whose_numbers_are_others_is_refused(saved, change):
 
 @pytest.mark.parametrize("suffix", [".pt", ".sog"])
 def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path, monkeypatch, suffix):
-    """The parts of these formats are read one by one. None is mapped, because that
-    would end the process."""
+    """The parts of these formats are read one by one, without mapping the file. If a
+    mapped file shrank, the process would end."""
     path, asset = tmp_path / f"a{suffix}", random_gaussians(5000, 0)
     if suffix == ".sog":
         write_asset(path, asset)
@@ -1448,5 +1456,5 @@ def test_small_sog_keeps_the_harmonics_of_every_gaussian(tmp_path):
     order = np.argsort(back.means @ (1.0, 1e3, 1e6))
     expected = sh[np.argsort(asset.means @ (1.0, 1e3, 1e6)), 1:]
     errors = back.sh[order, 1:] - expected
-    # Rounding of the means exchanges the places of a few neighbours.
+    # Rounding the means exchanges a few neighbours in the order.
     assert np.median(np.abs(errors)) < 2e-3

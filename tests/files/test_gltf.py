@@ -1,7 +1,6 @@
-"""glTF: where nodes place gaussians, and every form in which the specification stores
-numbers. Values are compared in the axes of the file, before the reader rotates them.
-
-Values are compared in the axes of the file, before the reader turns them.
+"""Reading glTF: where nodes place gaussians, and every form in which the specification
+stores numbers. Values are compared in the axes of the file, before the reader rotates
+them.
 """
 
 import json
@@ -143,8 +142,8 @@ def test_a_mesh_is_read_wherever_it_is_used(tmp_path):
 
 
 def test_scales_along_axes_stretch_gaussians(tmp_path):
-    """The extension defines it like this: the covariance is transformed by the matrix,
-    and colours are rotated by its rotation only."""
+    """As the extension defines, the matrix transforms the covariance, but colours are
+    only rotated by its rotation."""
     factors = np.array([0.5, 2.0, 3.0])
     file = GltfFile()
     file.nodes(
@@ -481,7 +480,7 @@ def test_a_document_may_have_its_buffers_inside(tmp_path):
 
 
 def test_a_glb_may_have_several_buffers(tmp_path):
-    """The first one is its own chunk; the others are files or data URIs."""
+    """The first buffer is the chunk in the file. The others are files or data URIs."""
     file = GltfFile()
     attributes = file.attributes(ASSET)
     view = file.document["bufferViews"][file.document["accessors"][0]["bufferView"]]
@@ -526,7 +525,7 @@ def test_bytes_that_another_extension_packs_are_refused(tmp_path):
     file.document["buffers"].append({"byteLength": 99, "extensions": {name: {"fallback": True}}})
     view = file.document["bufferViews"][0]
     view["extensions"] = {name: {"buffer": 0, "byteLength": view["byteLength"]}}
-    assert_same(read(file.write(path)), ASSET)  # the fallback exists
+    assert_same(read(file.write(path)), ASSET)  # the fallback can be read
     view["buffer"] = 1
     file.write(path)
     with pytest.raises(ValueError, match=f"bufferViews.0.: expected uncompressed data, got {name}"):
@@ -535,7 +534,8 @@ def test_bytes_that_another_extension_packs_are_refused(tmp_path):
 
 @pytest.mark.parametrize("place", ["primitive", "extension"])
 def test_numbers_that_another_extension_has_are_refused(tmp_path, place):
-    """Their accessors have no view, and would be read as zeros."""
+    """The accessors of compressed numbers have no view, so they would be read as
+    zeros."""
     file = GltfFile()
     attributes = file.attributes(ASSET)
     primitive = file.primitive(attributes)
@@ -578,7 +578,7 @@ def test_what_is_declared_and_not_done_is_told(tmp_path):
 
 
 def test_linear_colours_are_converted(tmp_path):
-    """Colours from all directions are encoded like those of a picture."""
+    """Colours in all directions are encoded in sRGB, like the colours of a picture."""
     rng = np.random.default_rng(3)
     sh = rng.normal(0, 0.05, ASSET.sh.shape).astype(np.float32)
     sh[:, 0] = rng.uniform(-0.5, 1.5, (20, 3))
@@ -595,7 +595,8 @@ def test_linear_colours_are_converted(tmp_path):
     colors = np.einsum("dk,nkc->ndc", bases, read(path).sh) + 0.5
     assert np.abs(colors - wanted).mean() < 0.002
     assert np.abs(colors - wanted).max() < 0.1
-    assert np.abs(light - wanted).mean() > 0.1  # otherwise the test would show nothing
+    # the asset is bright enough to make a difference
+    assert np.abs(light - wanted).mean() > 0.1
     assert "converted to sRGB" in notes_of(path)[0]
 
 
@@ -611,7 +612,7 @@ def test_names_of_drafts_are_read(tmp_path):
 
 @pytest.mark.parametrize("kind", [5121, FLOAT])
 def test_colours_of_drafts_are_read(tmp_path, kind):
-    """They store colour and opacity as COLOR_0."""
+    """Drafts of the extension store colour and opacity as COLOR_0."""
     rng = np.random.default_rng(4)
     rgba = np.rint(rng.uniform(0, 255, (20, 4)))
     file = GltfFile()
@@ -636,7 +637,7 @@ def test_colours_of_drafts_are_read(tmp_path, kind):
 
 
 def packed(file, asset, name):
-    """Return a primitive whose gaussians are a `.spz`, with the name of the
+    """Return a primitive whose gaussians are stored as `.spz`, and the name of the
     extension."""
     content = b"".join(spz.encode(asset, 2))
     attributes = {"POSITION": file.bare_accessor(asset.means)}
@@ -679,9 +680,9 @@ def test_spz_in_a_primitive_is_read(tmp_path, name):
 @pytest.mark.parametrize("axes", ["", "RUB", "LUF", "RDF", "RBU"])
 @pytest.mark.parametrize("released", [True, False])
 def test_the_axes_of_a_spz_in_a_primitive(tmp_path, axes, released):
-    """The axes that it records are used. Otherwise they are those of .spz if the
-    primitive has the properties that the released extension requires, and those of glTF
-    in drafts."""
+    """If the `.spz` records its axes, they are used. Otherwise the axes are those of
+    .spz if the primitive has the properties that the released extension requires, and
+    those of glTF in drafts."""
     content = b"".join(spz.encode(ASSET, 3, axes=axes))
     stored = spz.decode(tmp_path, b"".join(spz.encode(ASSET, 3)), claims_of(tmp_path), "LUF", "LUF")
     file = GltfFile()
@@ -768,7 +769,10 @@ def test_chunks_of_others_are_passed_over(tmp_path):
 
 
 def test_nodes_may_be_nested_deep(tmp_path):
-    """They are nested far deeper than Python's stack. The time is that of one pass."""
+    """The nodes are nested far deeper than Python's stack.
+
+    Reading takes the time of one pass.
+    """
     file = GltfFile()
     mesh = file.mesh(ASSET)
     count = 30_000
@@ -780,8 +784,8 @@ def test_nodes_may_be_nested_deep(tmp_path):
 
 
 def test_a_mesh_that_is_used_too_often_is_refused(tmp_path):
-    """The number of gaussians is the number that nodes place. The size of the file
-    bounds it."""
+    """Every use of a mesh by a node counts. The file's size bounds the number of
+    gaussians."""
     file = GltfFile()
     mesh = file.mesh(random_gaussians(np.random.default_rng(0), 100))
     file.nodes(*[{"mesh": mesh}] * 20_000, roots=range(20_000))
@@ -803,7 +807,8 @@ def test_too_much_json_is_named(tmp_path):
     file = GltfFile()
     file.nodes({"mesh": file.mesh(large)})
     path = file.write(tmp_path / "a.gltf")
-    assert path.stat().st_size > 1 << 20  # the data of buffers does not count
+    # the bytes of the buffers do not count towards the bound
+    assert path.stat().st_size > 1 << 20
     assert_same(read(path), large)
 
 

@@ -1,7 +1,5 @@
-"""Common properties of all readers and writers: for any damage, an error tells what is
-wrong and where. The tests of a format have the damage that only this format can have.
-
-Damage that only one format can have is in the tests of that format.
+"""Common properties of all readers and writers: for any damage, an error says what is
+wrong and where. Damage that is specific to one format is tested with that format.
 """
 
 import ast
@@ -41,8 +39,8 @@ def read_scene(path):
 
 
 def read_asset(path):
-    """Return all gaussians. Reading them in parts gives the same gaussians, or also an
-    error that tells what is wrong."""
+    """Return all gaussians, after checking that reading them in parts gives the same
+    gaussians, or also fails with an explanation."""
 
     def read_in_parts(path):
         file = open_asset(path)
@@ -131,7 +129,7 @@ def assert_refused(read, path):
 
 @pytest.mark.parametrize("reader", READERS)
 def test_good_files_are_read(tmp_path, reader):
-    """Otherwise the tests below would show nothing."""
+    """If the readers refused undamaged files, the tests below would show nothing."""
     name, content, read = READERS[reader]
     (tmp_path / name).write_bytes(content(tmp_path))
     read(tmp_path / name)
@@ -228,7 +226,7 @@ def test_other_places_are_refused(tmp_path, reader, place):
 def test_impossible_names_are_refused(tmp_path, reader):
     name, good, read = READERS[reader]
     (tmp_path / name).write_bytes(good(tmp_path))
-    assert_refused(read, tmp_path / name / name)  # below a file
+    assert_refused(read, tmp_path / name / name)  # a path below a file
     assert_refused(read, tmp_path / ("x" * 300 + name))
     with pytest.raises(ValueError, match="null"):
         read(os.fspath(tmp_path) + "/\0" + name)
@@ -271,7 +269,8 @@ def test_unreadable_files_are_named(tmp_path, reader):
 def test_every_truncation_is_refused(tmp_path, reader):
     name, content, read = READERS[reader]
     good = content(tmp_path)
-    # If the last digits of a text are missing, its last number is still a number.
+    # A text that lacks its last digits still ends with a number, so truncation begins
+    # before it.
     last = good.rfind(b" ") + 1 if reader == "ply" else len(good)
     # The tests of bundles truncate at every offset. Readers of the other formats ignore
     # most bytes.
@@ -418,7 +417,7 @@ def test_claims_of_a_header_cost_no_memory(tmp_path, claim):
     path = tmp_path / name
     path.write_bytes(content)
     read = v3dg.read_asset if name.endswith(".ply") else read_bundle
-    assert_refused(read, path)  # modules that are imported late are imported here
+    assert_refused(read, path)  # import late modules before memory is measured
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     tracemalloc.start()
     try:

@@ -1,5 +1,5 @@
-"""Files instead of their content: `v3dg.open`, and functions that accept the name of a
-file instead of a bundle, a scene or an asset."""
+"""The names of files are accepted by `v3dg.open`, and by functions that take a bundle,
+a scene or an asset."""
 
 import json
 

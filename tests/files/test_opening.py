@@ -11,7 +11,8 @@ from support.file_hash import PIECE, file_hash
 from support.random_bundle import random_bundle
 from v3dg import Bundle, Clusters, Gaussians, Groups, _core
 
-LARGE = 5 << 20  # bytes from which tables are read and hashed on separate threads
+# size in bytes from which tables are read and hashed on separate threads
+LARGE = 5 << 20
 
 
 SIZES = [0, 1, 127, 128, 129, 256, 4097, PIECE - 200, PIECE, PIECE + 1, 10 * PIECE]
@@ -139,7 +140,7 @@ def test_damage_is_called_damage_where_a_table_cannot_be(tmp_path):
     bundle.write(path)
     data = bytearray(path.read_bytes())
     place = bytes(data).index(bundle.clusters.offset.tobytes())
-    data[place] ^= 1  # the first offset is 0
+    data[place] ^= 1  # the first offset should be 0
     path.write_bytes(data)
     with pytest.raises(
         ValueError, match=r"damaged\.v3dg: hash: does not match the header and the tables"

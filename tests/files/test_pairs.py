@@ -22,7 +22,8 @@ from v3dg.export import write_site, write_streamed_sog, write_tiles, write_usd
 from v3dg.formats import _axes
 from v3dg.gaussians import Gaussians
 
-# The largest errors of one round trip. The errors of two formats add up at most.
+# The largest errors of one round trip. For a pair of formats, the two errors add up at
+# most.
 EXACT = Errors(position=0.0, shape=2e-6, color=0.0, harmonics=0.0)
 LARGEST = {
     ".ply": Errors(position=0.0, shape=2e-6, color=0.0, harmonics=0.0),
@@ -106,7 +107,8 @@ def test_tiles_of_any_up_have_z_up(tmp_path, figure, tilted):
     content = _axes.turned(Gaussians.concatenate(parts), _axes.MEMORY, _axes.GLTF)
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
     transform = np.reshape(root["transform"], (4, 4)).T[:3, :3]
-    y_up_to_z_up = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # of 3D Tiles, for glTF
+    # rotation of glTF content in 3D Tiles
+    y_up_to_z_up = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     means = content.means @ y_up_to_z_up.T @ transform.T
     wanted = _axes.turned(figure, _axes.MEMORY, _axes.Z_UP)
     nearest = np.square(wanted.means[:, None] - means).sum(axis=2).argmin(axis=1)

@@ -146,7 +146,8 @@ def assert_close(
         value = wanted[name] if isinstance(wanted, dict) else getattr(wanted, name)
         assert getattr(got, name).shape == value.shape
         assert getattr(got, name).dtype == np.float32
-        # Opacities and quaternions are rounded to float32 twice, for values up to 1.
+        # Opacities and quaternions, whose values are at most 1, are rounded to float32
+        # twice.
         bounds = {"scales": (scale_error, 0), "opacities": (0, 1.2e-7), "quats": (0, 1.2e-7)}
         rtol, atol = bounds.get(name, (0, 0))
         value = np.asarray(value, np.float32)
@@ -156,7 +157,7 @@ def assert_close(
 # A log scale of up to 12 is rounded to float32. The absolute error of the logarithm is
 # 12 * 2^-24, and so is the relative error of the scale.
 ROUND_TRIP_SCALE_ERROR = 8e-7
-# The exp functions of two libraries compute the same double, which is rounded to
+# The exp functions of two libraries compute the same double, which is then rounded to
 # float32 once.
 READ_SCALE_ERROR = 1.2e-7
 
@@ -221,7 +222,7 @@ def test_reads_any_layout(tmp_path_factory, layout):
     content, expected = layout
     path = tmp_path_factory.getbasetemp() / "layout.ply"
     path.write_bytes(content)
-    file = open_asset(path)  # without the warnings of reading an asset
+    file = open_asset(path)  # opening reads no gaussians, and so gives no warnings
     found = file.read(0, file.num_gaussians)
     assert_close(found, expected, scale_error=READ_SCALE_ERROR)
 
@@ -590,7 +591,7 @@ def test_broken_files_are_refused_with_what_is_wrong(tmp_path, case):
         read_asset(path)
     text = str(error.value)
     assert text.startswith(f"{path}: ")
-    assert text.isprintable()  # hence one line
+    assert text.isprintable()  # so it is a single line
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -598,7 +599,8 @@ def test_every_cut_of_a_file_is_refused(tmp_path, encoding):
     face = Element("face", {"indices": [np.arange(2, dtype="i4")]})
     content = ply_bytes([face, Element("vertex", random_columns(2, 0))], encoding)
     path = tmp_path / "cut.ply"
-    # If the last digits of a text are missing, its last number is still a number.
+    # A text that lacks its last digits still ends with a number, so truncation begins
+    # before it.
     last = content.rfind(b" ") + 1 if encoding == "ascii" else len(content)
     body = content.index(b"end_header")
     for size in (*range(0, body, 7), *range(body, last)):
@@ -768,8 +770,9 @@ def test_reading_needs_the_result_and_writing_next_to_nothing(tmp_path):
 @pytest.mark.parametrize("prefix", ["scalar_", "scal_", "scalar_scal_"])
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_what_cloudcompare_saves_is_read(tmp_path, prefix, encoding):
-    """It adds a prefix to names that it does not know, and so did 3dgsconverter before
-    it. Positions may become doubles, and the file also has colours."""
+    """CloudCompare adds a prefix to names that it does not know, and so did
+    3dgsconverter before it. Positions may become doubles, and the file also has
+    colours."""
     columns = random_columns(20, 1)
     kept = ("x", "y", "z")
     named = {name if name in kept else prefix + name: v for name, v in columns.items()}

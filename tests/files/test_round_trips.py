@@ -1,7 +1,7 @@
-"""What comes back of everything that is written: as many gaussians, and nearly the same
-pictures.
+"""Everything that is written can be read again with as many gaussians, and gives nearly
+the same pictures.
 
-The bounds are below what the tables of docs/formats.md have for two donuts.
+The bounds are lower than the values that docs/formats.md lists for two donuts.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def bundle(asset):
 
 def pictures(gaussians):
     drawn = [v3dg.rasterize(gaussians, camera, filter_px2=0.3).color for camera in CAMERAS]
-    return np.concatenate(drawn).clip(0, 1)  # one below the other
+    return np.concatenate(drawn).clip(0, 1)  # put the pictures below each other
 
 
 def assert_back(read, written, least_db):
@@ -64,7 +64,7 @@ def test_assets_come_back(tmp_path, asset, name, options, least_db):
 
 
 def test_a_web_page_comes_back(tmp_path, bundle):
-    write_site(bundle, tmp_path / "site", up="-y")  # does not rotate
+    write_site(bundle, tmp_path / "site", up="-y")  # "-y" needs no rotation
     assert_back(
         v3dg.read_asset(tmp_path / "site" / "lod-meta.json"), bundle.level_gaussians(0), 50.0
     )

@@ -92,7 +92,10 @@ def put(path, document):
 
 
 def test_instances_are_added_at_once_whatever_their_order(tmp_path, monkeypatch):
-    """The time then grows in proportion to their number, and not to its square."""
+    """Adding all instances at once takes time proportional to their number.
+
+    Adding them one by one would take time proportional to its square.
+    """
     instances = [{"bundle": "ab"[i % 2], "position": [i, 0, 0]} for i in range(100)]
     document = {
         "format": "v3dg-scene",
@@ -131,8 +134,8 @@ def test_missing_bundle_is_named(tmp_path):
 
 
 def changed(place, value, document=GOOD):
-    """Return a document with the value at a place of keys and indices; None removes the
-    place."""
+    """Return the document with the value at a path of keys and indices replaced. None
+    removes it."""
     document = json.loads(json.dumps(document))
     target = document
     for key in place[:-1]:
@@ -322,13 +325,15 @@ def test_published_layouts_are_read(tmp_path):
     assert list(cameras) == ["camera_0", "camera_1"]
     camera = cameras["camera_0"]
     np.testing.assert_allclose(camera.position, [0, -5, 1])
-    np.testing.assert_allclose(camera.viewmat[2, :3], [0, 1, 0], atol=1e-12)  # looks along y
+    # the camera looks along y
+    np.testing.assert_allclose(camera.viewmat[2, :3], [0, 1, 0], atol=1e-12)
     assert camera.fx == pytest.approx(32 / np.tan(0.4))
     assert camera.fy == pytest.approx(24 / np.tan(0.3))
 
 
 def test_published_layouts_find_bundles_where_a_build_puts_them(tmp_path):
-    """The bundles are beside the layout, or beside the assets of the published code."""
+    """The bundles are in the folder of the layout, or with the assets of the published
+    code."""
     (tmp_path / "layouts").mkdir()
     path = put(tmp_path / "layouts" / "layout.json", published_layout())
     with pytest.raises(

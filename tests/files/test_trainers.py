@@ -83,10 +83,10 @@ COLORS = {
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("kind", COLORS)
 def test_base_colours_stand_for_coefficients(tmp_path, kind, encoding):
-    """nerfstudio writes them like this with `--ply-color-mode rgb`."""
+    """nerfstudio writes base colours like this with `--ply-color-mode rgb`."""
     dtype, largest, names = COLORS[kind]
     if encoding == "ascii" and dtype == "f2":
-        dtype = "f4"  # the text of a half is as long as that of a float
+        dtype = "f4"  # the name of the half type is as long as that of a float
     rng = np.random.default_rng(0)
     columns = random_columns(20, 0)
     wanted = dict(columns)
@@ -131,8 +131,8 @@ def test_gaussians_of_2dgs_have_no_thickness(tmp_path, encoding):
 
 
 def test_the_filter_of_mip_splatting_is_applied(tmp_path):
-    """The formulas are those of `get_scaling_with_3D_filter` and
-    `get_opacity_with_3D_filter` in its code."""
+    """The expected values follow `get_scaling_with_3D_filter` and
+    `get_opacity_with_3D_filter` in the code of Mip-Splatting."""
     columns = random_columns(20, 1)
     sizes = np.random.default_rng(1).uniform(0, 2, 20).astype(np.float32)
     sizes[0] = 0
@@ -311,7 +311,8 @@ FILES += ["sh3_mkkellogg_2.ksplat", "sh0_gaussforge.splat"]
 
 
 def test_only_records_are_recognised_as_a_splat(tmp_path):
-    """A `.splat` file has no signature, so its numbers must show that it is one."""
+    """A `.splat` file has no signature, so it is recognised by the values of its
+    records."""
     content = (FIXTURES / "sh0_gaussforge.splat").read_bytes()
     path = tmp_path / "a.ply"
     turned = bytearray(content)
@@ -351,7 +352,7 @@ def test_a_ply_called_splat_is_recognised(tmp_path):
 
 
 def test_a_splat_that_begins_like_a_ksplat_is_a_splat(tmp_path):
-    """Only its first numbers look like those of a header."""
+    """The file begins with values that could be a `.ksplat` header."""
     rows = np.random.default_rng(0).integers(1, 255, (200, 32)).astype(np.uint8)
     rows[0] = np.frombuffer(struct.pack("<BB2xIIIIH10x", 0, 1, 1, 1, 1, 1, 0), np.uint8)
     (tmp_path / "a.splat").write_bytes(rows.tobytes())

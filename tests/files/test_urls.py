@@ -40,7 +40,7 @@ URL = "memory://in/many.v3dg"
 
 @pytest.fixture
 def there(monkeypatch):
-    """A place that only fsspec can reach."""
+    """The address of a file system in memory, which only fsspec can read."""
     monkeypatch.setattr("v3dg._urls.opened._opened", {})
     memory = fsspec.filesystem("memory")
     yield memory
@@ -62,7 +62,8 @@ def fetched(there, monkeypatch):
 
 
 def put(there, tmp_path, seed=0):
-    """A bundle of about 250 pages there, and the same file here."""
+    """A bundle of about 250 pages at the remote address, and the same file on the local
+    disk."""
     rng = np.random.default_rng(seed)
     path = tmp_path / "many.v3dg"
     lod_bundle(rng, blob(rng, 5000, sh_degree=1), 32).write(path)
@@ -145,7 +146,7 @@ def test_pictures_fetch_what_they_need_and_no_part_twice(fetched, many):
             bundle.level_gaussians(level).means, here.level_gaussians(level).means
         )
     np.testing.assert_array_equal(v3dg.open(URL).gaussians.sh, here.gaussians.sh)
-    # Blocks that contain parts of two pages may have been requested for both.
+    # A block that contains parts of two pages may have been requested for both pages.
     assert num_bytes(fetched) <= many.stat().st_size + 1024 * len(fetched)
     count = len(fetched)
     assert bundle.gaussians is not None
@@ -242,7 +243,7 @@ def test_a_file_of_unknown_size_is_fetched_whole(there, fetched, many, monkeypat
 
 
 def test_a_process_ends_while_parts_are_on_their_way(tmp_path):
-    """This also holds while threads wait for Python."""
+    """The process also ends while threads wait for Python's lock."""
     code = """
 import sys, time
 import fsspec, numpy as np
@@ -265,7 +266,10 @@ for _ in range(3):
 
 
 class _Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves one folder, with ranges, and counts the bytes that it sends."""
+    """A web server of one folder.
+
+    It supports ranges, and counts the bytes that it sends.
+    """
 
     protocol_version = "HTTP/1.1"
     knows_ranges = True
@@ -305,7 +309,7 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def web(tmp_path, monkeypatch):
-    """A web server of a folder: its address and the number of bytes that it sent."""
+    """The address of a web server of a folder, and the number of bytes that it sent."""
     pytest.importorskip("aiohttp")
     monkeypatch.setattr("v3dg._urls.opened._opened", {})
 
@@ -419,7 +423,7 @@ def test_without_fsspec_the_error_says_how_to_get_it(monkeypatch):
         v3dg.open("memory://in/b.ply")
 
 
-# ---- Names, and what is shown of them.
+# ---- How names are shown.
 @pytest.mark.parametrize(
     ("url", "text"),
     [
@@ -555,8 +559,8 @@ NAMES = {
 
 @pytest.fixture
 def names(web, monkeypatch):
-    """Make this server all of these hosts: 127.0.0.1 then counts as public, and other
-    addresses as private."""
+    """Resolve all of these host names to this server. 127.0.0.1 then counts as public,
+    and other addresses as private."""
     known = dict(NAMES)
 
     async def resolve(host, port):
@@ -572,8 +576,8 @@ def names(web, monkeypatch):
 
 
 def redirecting(web, places):
-    """Make the server redirect each path to an address, in which `{port}` is its own
-    port."""
+    """Make the server redirect each path to an address. `{port}` in the address is the
+    server's own port."""
     answer = web.handler.answer
 
     def redirected(self, with_body):
@@ -645,7 +649,7 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
     assert web.sent == []
 
 
-# ---- What answers may cost, and what is told of those that are wrong.
+# ---- Answers that are too large or wrong.
 @pytest.mark.parametrize(
     ("name", "kind", "message"),
     [
@@ -764,7 +768,7 @@ def test_a_chain_of_places_is_refused():
         v3dg.open("zip://a.zip::http://127.0.0.1:1/a.ply")
 
 
-# ---- What stays, and what is read again.
+# ---- Files that stay after the process ends, and files that change.
 @pytest.mark.parametrize("ends_by", ["SIGKILL", "SIGINT", "SIGTERM"])
 def test_nothing_fetched_stays_however_a_process_ends(web, tmp_path, ends_by):
     (tmp_path / "tmp").mkdir()
@@ -814,8 +818,8 @@ def test_descriptors_of_what_has_changed_are_closed(web, tmp_path):
 
 
 def _open_files():
-    """Yield the targets of this process's descriptors; other threads may close some
-    meanwhile."""
+    """Yield the targets of this process's file descriptors. Other threads may close
+    some of them meanwhile."""
     for name in os.listdir("/proc/self/fd"):
         with contextlib.suppress(FileNotFoundError):
             yield os.readlink(f"/proc/self/fd/{name}")
@@ -840,8 +844,8 @@ def test_every_format_is_read_from_a_url_and_names_it_in_errors(there, tmp_path,
 
 
 def test_a_gltf_at_a_url_has_its_buffers_inside(there, tmp_path):
-    """It is read through an open file of this process, whose folder contains all other
-    open files."""
+    """A remote file is read through a file descriptor, and the folder of that
+    descriptor contains all other open files."""
     asset = random_gaussians(np.random.default_rng(0), 30)
     file = GltfFile()
     file.nodes({"mesh": file.mesh(asset)})

@@ -1,5 +1,5 @@
-"""OpenUSD is read and written. OpenUSD's own validators check the files, and its own
-choice of levels is tested."""
+"""Reading and writing OpenUSD. OpenUSD's own validators check the files, and its own
+selection of levels is tested."""
 
 import json
 import math
@@ -50,8 +50,8 @@ def test_an_asset_reads_back(tmp_path, suffix, degree):
 
 @pytest.mark.parametrize("degree", range(4))
 def test_coefficients_say_how_many_belong_to_a_gaussian(tmp_path, degree):
-    """Requirement VG.035 of NVIDIA's usd-validation: interpolation `vertex`, and an
-    elementSize of the degree's number of coefficients."""
+    """Requirement VG.035 of NVIDIA's usd-validation: the interpolation is `vertex`, and
+    the elementSize is the number of coefficients of the degree."""
     path = tmp_path / "a.usdc"
     v3dg.write_asset(path, random_gaussians(np.random.default_rng(0), 5, degree))
     stage = Usd.Stage.Open(os.fspath(path))
@@ -64,8 +64,8 @@ def test_coefficients_say_how_many_belong_to_a_gaussian(tmp_path, degree):
 @pytest.mark.witness
 @pytest.mark.parametrize("name", ["asset.usdc", "asset.usdz", "scene.usda"])
 def test_nvidias_rules_find_nothing(tmp_path, name):
-    """Those of usd-validation-nvidia that it has on, but for its advice to store large
-    arrays in binary files; and the rule for splats."""
+    """The rules are those that usd-validation-nvidia enables, except for its advice to
+    store large arrays in binary files, and additionally the rule for splats."""
     nvidia = pytest.importorskip("usd_validation_nvidia")
     generator = np.random.default_rng(0)
     if name == "scene.usda":
@@ -116,7 +116,8 @@ def test_a_bundle_has_its_levels(tmp_path, seed):
         wanted = bundle.level_gaussians(level)
         np.testing.assert_array_equal(np.array(prim.GetAttribute("positions").Get()), wanted.means)
     assert len(levels) == bundle.num_levels
-    turned = bundle.level_gaussians(0).transform((0.5**0.5, 0.5**0.5, 0, 0))  # z becomes -y
+    # rotates z to -y
+    turned = bundle.level_gaussians(0).transform((0.5**0.5, 0.5**0.5, 0, 0))
     assert_same(v3dg.read_asset(tmp_path / "a.usdc"), turned)
 
 
@@ -154,10 +155,11 @@ def test_a_scene_is_a_point_instancer(tmp_path):
     assert list(instancer.GetProtoIndicesAttr().Get()) == scene.instance_bundle.tolist()
     matrices = np.array(instancer.ComputeInstanceTransformsAtTime(0, 0))
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/world")))
-    np.testing.assert_allclose([0, 1, 0, 0] @ world, [0, 0, 1, 0], atol=1e-6)  # y becomes z
+    # y of the prototype is z in the world
+    np.testing.assert_allclose([0, 1, 0, 0] @ world, [0, 0, 1, 0], atol=1e-6)
     for i, matrix in enumerate(matrices):
-        # Vectors in OpenUSD are rows. Instances come before the prototypes' own
-        # transforms, which are empty.
+        # Vectors in OpenUSD are rows, so instances come before the transforms of the
+        # prototypes, which are identities here.
         np.testing.assert_allclose(
             matrix[:3, :3].T, scene.scales[i] * scene.rotations[i], atol=1e-3
         )
@@ -254,8 +256,8 @@ def test_a_scene_reads_back_as_a_scene(tmp_path, suffix):
 
 @pytest.mark.parametrize("is_instanceable", [True, False])
 def test_references_to_an_asset_are_instances_of_it(tmp_path, is_instanceable):
-    """The references are to files in the same folder, from nested Xforms. An asset
-    without references is one instance, and a changed asset is another asset."""
+    """Nested Xforms refer to files in the same folder. An asset without references is
+    one instance, and an asset with other values is a separate asset."""
     asset = Usd.Stage.CreateNew(os.fspath(tmp_path / "asset.usdc"))
     asset.SetDefaultPrim(UsdGeom.Xform.Define(asset, "/house").GetPrim())
     v3dg.formats.usd.define(
@@ -300,7 +302,7 @@ def test_instancers_may_hold_instancers_and_hide_instances(tmp_path):
         )
         instancer.CreateProtoIndicesAttr([0, 0, 0])
         instancer.CreatePositionsAttr([Gf.Vec3f(*step) * k for k in range(3)])
-        # In half precision, like most programs.
+        # Most programs write orientations in half precision.
         instancer.CreateOrientationsAttr([Gf.Quath(0.5, 0.5, -0.5, 0.5)] * 3)
     UsdGeom.PointInstancer(stage.GetPrimAtPath("/rows")).InvisId(1, 0)
     stage.GetRootLayer().Save()
@@ -337,7 +339,8 @@ def new_stage(path):
 
 
 def read_with_notes(path):
-    """Return gaussians in the axes of their stage, and what else the file declares."""
+    """Return the gaussians in the axes of their stage, and the other declarations of
+    the file."""
     file = open_asset(path)
     return half_turn(file.read(0, file.num_gaussians), "x"), list(file.declared.notes)
 
@@ -346,8 +349,8 @@ POINTS = [Gf.Vec3f(1, 2, 3), Gf.Vec3f(4, 5, 6)]
 
 
 def test_what_is_left_out_has_the_default_of_the_schema(tmp_path):
-    """The defaults in its documentation are: no rotation, unit scale, opaque, and one
-    grey."""
+    """The schema's documentation gives the defaults: no rotation, unit scale, opaque,
+    and one grey."""
     stage = new_stage(tmp_path / "a.usda")
     new_prim(stage).GetAttribute("positions").Set(POINTS)
     stage.GetRootLayer().Save()
@@ -381,8 +384,8 @@ def test_the_degree_of_harmonics_is_3_by_default(tmp_path):
     found, notes = read_with_notes(tmp_path / "a.usda")
     np.testing.assert_array_equal(found.sh, values.reshape(2, 16, 3))
     assert notes == []
-    # They are too few for degree 4, and ignored; for degree 2 the last ones are left
-    # out.
+    # The coefficients are too few for degree 4, so they are ignored. For degree 2, the
+    # last ones are ignored.
     prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(4)
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
@@ -515,8 +518,8 @@ def test_what_a_prim_says_besides_is_told(tmp_path):
 
 
 def stage_with_color_space(path, asset, name, place):
-    """A stage whose coefficients are in the colour space `name`, which `place`
-    declares."""
+    """Return a stage whose coefficients are in the colour space `name`. The function
+    `place` declares it."""
     stage = new_stage(path)
     world = UsdGeom.Xform.Define(stage, "/world").GetPrim()
     prim = v3dg.formats.usd.define(stage, "/world/a", half_turn(asset, "x"))
@@ -532,7 +535,10 @@ def stage_with_color_space(path, asset, name, place):
 @pytest.mark.parametrize("place", ["attribute", "prim", "parent"])
 @pytest.mark.parametrize("name", ["lin_rec709_scene", "srgb_rec709_scene", "lin_ap1_scene"])
 def test_the_colour_space_of_coefficients_counts(tmp_path, name, place):
-    """Whatever declares it. Linear grey of 0.2 is 0.4845 in sRGB (IEC 61966-2-1)."""
+    """The declaration of any prim has effect.
+
+    Linear grey of 0.2 is 0.4845 in sRGB (IEC 61966-2-1).
+    """
     asset = random_gaussians(np.random.default_rng(0), 3, 1)
     asset.sh[:] = 0
     asset.sh[:, 0] = (0.2 - 0.5) / SH_C0

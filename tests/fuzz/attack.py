@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from fuzz.attacks.pool import attack
 
-# Shares of the time if all kinds run. Kinds that find most per second need the least
+# Fractions of the time if all kinds run. Kinds that find faults quickly need the least
 # time.
 KINDS = {
     "files": 0.3,

@@ -1,5 +1,4 @@
-"""Changes that keep the form of a document, which random changes of bytes hardly ever
-do."""
+"""Changes that keep a document valid JSON, which random changes of bytes rarely do."""
 
 import json
 
@@ -66,7 +65,7 @@ def changed_json(text, rng):
 
 
 def _places(value):
-    """Yield the container and the key of every value in the document."""
+    """Yield every value in the document, as its container and its key."""
     keys = (
         value.keys()
         if isinstance(value, dict)

@@ -1,5 +1,5 @@
-"""Fuzz the .ply reader or the C library, which are C++, for some time, and store the
-inputs that together reach all of the code that was reached.
+"""Fuzzes the .ply reader or the C library, which are C++, for some time. Stores a set
+of inputs that together reach all code that was reached.
 
     python tests/fuzz/run.py SECONDS [ply | c_library]
 
@@ -38,7 +38,8 @@ PLY_SOURCES = {
 }
 MAX_BYTES = {"ply": 8192, "c_library": 16384}
 KEPT_BYTES = {"ply": 1000, "c_library": 12000}
-LARGEST_SEED = 10_000  # bytes; a few of the broken files are made large
+# limit in bytes, because a few of the broken files are intentionally large
+LARGEST_SEED = 10_000
 
 
 def ply_seeds():
@@ -55,7 +56,8 @@ def ply_seeds():
 
 
 def c_library_seeds():
-    """Bundles of all versions, and what the fuzzers of the Python readers kept."""
+    """Return bundles of all versions, and the inputs that the fuzzers of the Python
+    readers kept."""
     yield from (path.read_bytes() for path in sorted(GOLDEN.glob("*.v3dg")))
     for name in ("bundle", "scene"):
         with zipfile.ZipFile(HERE / "corpus" / f"{name}.zip") as archive:
@@ -70,8 +72,8 @@ def cmake_sources(*names):
 
 
 def c_library_sources(folder):
-    """Sources of the C library. Those that are compiled once for each instruction set
-    are all compiled for the plain one here."""
+    """Return the sources of the C library. Sources that are compiled for several
+    instruction sets are compiled only for the basic one here."""
     yield from cmake_sources("V3DG_CUT_SOURCES", "V3DG_C_SOURCES")
     for isa in ("baseline", "avx2", "avx512"):
         for source in cmake_sources("V3DG_CUT_SIMD_SOURCES"):
@@ -99,7 +101,7 @@ def compiled(folder, target="ply"):
 
 
 def keep(corpus, archive, max_bytes):
-    """The same inputs give the same archive."""
+    """Store inputs in an archive whose bytes depend only on them."""
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
         for path in sorted(corpus.iterdir()):
             if path.stat().st_size <= max_bytes:
@@ -121,7 +123,8 @@ def main():
     archive = HERE / "corpus" / f"{target}.zip"
     if archive.exists():
         zipfile.ZipFile(archive).extractall(found)
-    shutil.copy(GOLDEN / "bundle_3_quantized.v3dg", folder / "a.v3dg")  # of scenes
+    # the inputs for scenes refer to this bundle
+    shutil.copy(GOLDEN / "bundle_3_quantized.v3dg", folder / "a.v3dg")
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     program = compiled(folder, target)
     command = [

@@ -1,5 +1,5 @@
-"""Readers with the conditions that must hold for any input, for inputs that were kept,
-and zips of all inputs."""
+"""Readers, with the conditions that must hold for any input. They are used for inputs
+that fuzzers kept and for zips of all inputs."""
 
 import gzip
 import io
@@ -51,14 +51,15 @@ def read_json(content, folder):
 
 
 def read_format(content, folder):
-    """The first byte tells the format, and whether the rest is a file of this format or
-    the content of its compressed part."""
+    """The first byte determines the format, and whether the rest is a whole file or the
+    content of its compressed part."""
     suffix, packed = FORMATS[content[0] % len(FORMATS)] if content else FORMATS[0]
     path = put(folder / f"fuzz{suffix}", packed(content[1:]))
     with only_errors_that_name(path):
         asset = read_asset(path)
         assert len(asset) == open_asset(path).num_gaussians
-        assert len(asset) <= (1 << 18) + path.stat().st_size  # docs/robustness.md
+        # the limit in docs/robustness.md
+        assert len(asset) <= (1 << 18) + path.stat().st_size
 
 
 def zip_bytes(entries, compression=zipfile.ZIP_STORED):
@@ -66,7 +67,8 @@ def zip_bytes(entries, compression=zipfile.ZIP_STORED):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", compression) as archive:
         for name, content in entries:
-            archive.NameToInfo.pop(name, None)  # zipfile would warn of the second one
+            # zipfile would warn about a second entry of this name
+            archive.NameToInfo.pop(name, None)
             archive.writestr(zipfile.ZipInfo(name), content, compression)
     return stream.getvalue()
 
@@ -119,21 +121,21 @@ class only_errors_that_name:
 
 
 def parts_of(data):
-    """Return the header, its end, and from there the ends of the pages and of the
-    file's hash; None if the file lacks them."""
+    """Return the header and its end, and from there the ends of the pages and of the
+    file's hash; None if the file is too short."""
     start = 8 + int.from_bytes(data[:8], "little")
     try:
         header = json.loads(data[8:start])
         ends = [header[name]["data_offsets"][1] for name in ("pages", "hash")]
         is_inside = {int} == set(map(type, ends)) and 0 <= ends[0] < ends[1] <= len(data) - start
         return (header, start, *ends) if is_inside else None
-    except Exception:  # any kind of damage
+    except Exception:  # the file may have any kind of damage
         return None
 
 
 def with_fitting_hashes(data):
     """Return the file with corrected hashes of its pages and of itself, as far as its
-    header leads to them."""
+    header allows."""
     data = bytearray(data)
     try:
         header, start, pages_end, hash_end = parts_of(data)
@@ -149,6 +151,6 @@ def with_fitting_hashes(data):
         covered = data[:start] + data[start + pages_end : start + hash_end - 16]
         version = int(header["__metadata__"]["version"])
         data[start + hash_end - 16 : start + hash_end] = file_hash(covered, version)
-    except Exception:  # the header leads nowhere
+    except Exception:  # the header is damaged, so the pages cannot be found
         pass
     return bytes(data)

@@ -1,5 +1,5 @@
 """Small bundles of each version of the format. Running this file writes those of the
-newest version, which is done once only."""
+newest version; this is done only once per version."""
 
 from pathlib import Path
 

@@ -6,7 +6,9 @@ import numpy as np
 
 from . import project
 
-REACH_SIGMAS = 3.33  # sqrt(2 ln 255): the distance at which an opaque gaussian falls below 1/255
+# sqrt(2 ln 255), the distance at which the alpha of an opaque gaussian falls below
+# 1/255
+REACH_SIGMAS = 3.33
 
 
 def bound_by_boxes(means: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Median split of points into the leaves of a perfect binary tree, one point at a
+"""Splits points at medians into the leaves of a perfect binary tree, one point at a
 time."""
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ def _halves(means: np.ndarray, indices: list[int], unit: int) -> tuple[list[int]
     if not indices:
         return [], []
     points = means[indices]
-    axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))  # the first of equal axes
+    # the lowest of equally long axes
+    axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
     ranked = sorted(indices, key=lambda i: (float(means[i, axis]), i))
     num_units = -(-len(ranked) // unit)
     num_left = (num_units + 1) // 2 * unit

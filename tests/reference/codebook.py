@@ -8,7 +8,7 @@ BINS, ROUNDS, EVEN = 4096, 16, 0.25
 
 
 def codebook_of(values):
-    """Return 256 ascending numbers near the values (N,)."""
+    """Return 256 ascending numbers that approximate the values (N,)."""
     distinct = np.unique(values)
     if len(distinct) <= SIZE:
         return (
@@ -26,8 +26,8 @@ def codebook_of(values):
 
 
 def palette_of(vectors, size):
-    """Return vectors (K, D) that approximate many (N, D), and the index of the vector
-    for each (N,)."""
+    """Return vectors (K, D) that approximate the vectors (N, D), and the index (N,) of
+    the best vector for each."""
     vectors = vectors.astype(np.float64)
     parts = [np.arange(len(vectors))] if len(vectors) else []
     while parts and len(parts) < size:

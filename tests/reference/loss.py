@@ -31,9 +31,9 @@ def dssim(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def loss(color, alpha, target_color, target_alpha, weights) -> torch.Tensor:
-    """Return the weighted sum of L1 on premultiplied colour (H, W, 3), 1 - SSIM of it,
-    L1 on alpha (H, W), and, relative to both parts with L1, those of the means of cells
-    of 4 x 4 px; `weights` are in this order."""
+    """Return the weighted sum of these parts: L1 on premultiplied colour (H, W, 3), its
+    1 - SSIM, L1 on alpha (H, W), and L1 on the means of cells of 4 x 4 px. The weight
+    of the last part is relative to the two L1 parts. `weights` are in this order."""
     l1, ssim, on_alpha, on_cells = weights
     differences = torch.cat([color - target_color, (alpha - target_alpha)[..., None]], dim=-1)
     cells = torch.nn.functional.avg_pool2d(differences.permute(2, 0, 1), 4)

@@ -1,4 +1,4 @@
-"""3D gaussians to 2D ellipses in the picture, in float64.
+"""Projects 3D gaussians to 2D ellipses in the picture, in float64.
 
 Source: Zwicker et al., EWA splatting, 2002, with gsplat 1.5's clamped Jacobian and
 opacity compensation.
@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# This is a share of half the field of view. Beyond it the Jacobian no longer follows
-# the mean.
+# As a fraction of half the field of view. Beyond this margin, the Jacobian is clamped.
 FIELD_OF_VIEW_MARGIN = 0.3
 
 
@@ -19,12 +18,13 @@ FIELD_OF_VIEW_MARGIN = 0.3
 class Projection:
     mean_px: np.ndarray  # (N,2)
     covariance_px2: np.ndarray  # (N,2,2), filter included
-    determinant: np.ndarray  # (N,) of that covariance
-    # (N,) factor on the opacity that preserves the integral of a gaussian under the
-    # filter.
+    determinant: np.ndarray  # (N,), the determinant of covariance_px2
+    # (N,) factor of the opacity that preserves the integral of a gaussian when the
+    # filter is added.
     compensation: np.ndarray
     depth: np.ndarray  # (N,)
-    # (N,) at least as far as the near plane, finite, and with a positive area
+    # (N,) whether the gaussian is not before the near plane, is finite, and has a
+    # positive area
     is_drawable: np.ndarray
 
 
@@ -45,7 +45,7 @@ def rotation(quats: np.ndarray) -> np.ndarray:
 
 
 def covariance(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Return (N,3,3) in the gaussians' own space."""
+    """Return the covariances (N,3,3) in the gaussians' own space."""
     axes = rotation(quats) * np.asarray(scales, np.float64)[:, None, :]
     return axes @ axes.transpose(0, 2, 1)
 
@@ -68,7 +68,8 @@ def project(gaussians, camera, *, filter_px2: float = 0.0) -> Projection:
             jacobian[:, i, i] = focal[i] / depth
             jacobian[:, i, 2] = -focal[i] * bounded[:, i] / depth
         axes = rotation(gaussians.quats) * np.asarray(gaussians.scales, np.float64)[:, None, :]
-        rows = jacobian @ to_view @ axes  # (N,2,3): the covariance is rows rows^T
+        # (N,2,3); the projected covariance is rows rows^T
+        rows = jacobian @ to_view @ axes
         unfiltered = rows @ rows.transpose(0, 2, 1)
         # The determinant as a sum of squares (Cauchy-Binet) keeps the digits of needles
         # that are seen end-on.

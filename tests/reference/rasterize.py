@@ -1,4 +1,4 @@
-"""Every gaussian is evaluated at every pixel, front to back, in float64."""
+"""Evaluates every gaussian at every pixel, front to back, in float64."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ def rasterize(
     sh_degree=None,
     min_transmittance=None,
 ) -> Picture:
-    """Pixels stop before TRANSMITTANCE_MIN. If `min_transmittance` is given, they stop
-    behind the gaussian that leaves less, and the remaining light is given to the
-    blended gaussians."""
+    """Draw gaussians. A pixel stops before the gaussian that would reduce its
+    transmittance below TRANSMITTANCE_MIN. If `min_transmittance` is given, a pixel
+    stops after the gaussian that reduces it below this value, and the remaining light
+    is given to the blended gaussians."""
     stop = TRANSMITTANCE_MIN if min_transmittance is None else min_transmittance
     projection = project(gaussians, camera, filter_px2=filter_px2)
     colors = reference_sh.color(
@@ -69,8 +70,8 @@ def rasterize(
             break
         a, b = projection.covariance_px2[i][0]
         dx, dy = x - projection.mean_px[i, 0], y - projection.mean_px[i, 1]
-        # As a sum of squares (Cholesky), the exponent of a needle never becomes
-        # positive by rounding.
+        # Written as a sum of squares (Cholesky), the exponent of a needle is never
+        # positive because of rounding.
         along = dx * dx / a
         across = (a * dy - b * dx) ** 2 / (a * projection.determinant[i])
         falloff = opacities[i] * np.exp(-0.5 * (along + across))

@@ -1,5 +1,5 @@
-"""The same pictures as a chain of torch operations in float64, so that autograd
-provides the gradients."""
+"""Draws the same pictures as rasterize.py with torch operations in float64, so that
+autograd provides the gradients."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 def _rotation(quats):
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1, eps=1e-100).unbind(1)
     zero = torch.zeros_like(w)
-    # exp of the generator: R = I + 2 w [v] + 2 [v]^2
+    # With v the vector part of the quaternion: R = I + 2 w [v] + 2 [v]^2
     v = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
     return torch.eye(3, dtype=quats.dtype) + 2 * w[:, None, None] * v + 2 * v @ v
 

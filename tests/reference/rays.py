@@ -20,19 +20,21 @@ LUMA = np.array([0.2126, 0.7152, 0.0722])
 class Rays:
     color: np.ndarray  # (R,3) premultiplied
     alpha: np.ndarray  # (R,)
-    mean_range: np.ndarray  # (R,) by blend weight, 0 where nothing is hit
-    # Per ray, ordered by range: (K,3) range, blend weight, luma.
+    # (R,) mean range, weighted by blend weight; 0 where nothing is hit
+    mean_range: np.ndarray
+    # For each ray (K,3): range, blend weight and luma, ordered by range.
     contributions: list[np.ndarray]
-    # (R,) smallest relative distance of an alpha to 1/255: below a band, rounding may
-    # decide otherwise than float64 does.
+    # (R,) smallest relative distance of an alpha to 1/255. If it is small, rounding may
+    # decide differently than in float64.
     cutoff_distance: np.ndarray
 
 
 def cast(
     gaussians, eye, directions, *, filters_rad2=0.0, antialiased=False, near=0.01, far=np.inf
 ) -> Rays:
-    """Blend on each ray (R,3), unit vectors in the world, the largest values of the
-    gaussians, ordered by their distances."""
+    """Blend gaussians on rays (R,3), which are unit vectors in the world. Each gaussian
+    has its largest value on the ray; gaussians are ordered by the distances of these
+    values."""
     means = gaussians.means.astype(np.float64) - eye
     covariances, opacities = _filtered(gaussians, means, filters_rad2, antialiased)
     alphas, ranges = _largest(means, covariances, opacities, directions)
@@ -64,9 +66,10 @@ def cast(
 
 
 def _filtered(gaussians, means, filters_rad2, antialiased):
-    """Return covariances and opacities with a filter. It adds its variance times the
-    squared distance of the mean. Compensated opacities preserve the integral over the
-    plane across the mean."""
+    """Return covariances and opacities with a filter. The filter adds its variance
+    multiplied by the squared distance of the mean. Compensated opacities preserve the
+    integral over the plane through the mean that is perpendicular to the view
+    direction."""
     axes = rotation(gaussians.quats) * gaussians.scales[:, None, :].astype(np.float64)
     covariances = axes @ axes.transpose(0, 2, 1)
     variances = filters_rad2 * (means**2).sum(axis=1)
@@ -77,7 +80,8 @@ def _filtered(gaussians, means, filters_rad2, antialiased):
 
 
 def _largest(means, covariances, opacities, directions):
-    """Return (R,N) the largest alphas on rays, and the distances of their places."""
+    """Return the largest alphas (R,N) on rays, and the distances at which they are
+    reached."""
     precisions = np.linalg.inv(covariances)
     forward = directions @ np.einsum("nij,nj->ni", precisions, means).T
     ranges = forward / np.einsum("ri,nij,rj->rn", directions, precisions, directions)
@@ -87,8 +91,8 @@ def _largest(means, covariances, opacities, directions):
 
 
 def _across(covariances, means):
-    """Return the determinants of the covariances, projected along the directions of the
-    means."""
+    """Return the determinants of the covariances after projection along the directions
+    of the means."""
     unit = means / np.linalg.norm(means, axis=1, keepdims=True)
     first = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)

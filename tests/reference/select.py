@@ -8,14 +8,14 @@ import numpy as np
 
 
 def footprint_px2(ball: np.ndarray, eye: np.ndarray, focal_px2: float) -> float:
-    """Return the area on the screen of the solid angle of a ball; it is infinite from
-    inside."""
+    """Return the area on the screen of the solid angle of a ball. It is infinite if the
+    eye is inside the ball."""
     center, radius = np.float64(ball[:3]), float(ball[3])
     distance = float(np.linalg.norm(center - eye))
     if distance <= radius:
         return math.inf
-    # This is 2 pi (1 - cos a), written with sin^2 because 1 - cos loses all digits for
-    # far balls.
+    # This is 2 pi (1 - cos a), where a is the ball's angular radius. It is written with
+    # sin^2, because 1 - cos a loses all digits for distant balls.
     return 4 * math.pi * math.sin(0.5 * math.asin(radius / distance)) ** 2 * focal_px2
 
 
@@ -47,8 +47,8 @@ def metrics(scene, i: int, camera, footprint: str = "solid_angle") -> list[float
 
 
 def cut(scene, camera, tolerance: float, footprint: str = "solid_angle") -> list[tuple[int, int]]:
-    """Return the (instance, cluster) pairs whose own group fits and whose parent group
-    does not."""
+    """Return the (instance, cluster) pairs for which the metric of the cluster's own
+    group is within the tolerance, and that of its parent group is not."""
     pairs = []
     for i in range(len(scene)):
         clusters = scene.bundles[scene.instance_bundle[i]].clusters
@@ -64,8 +64,8 @@ def cut(scene, camera, tolerance: float, footprint: str = "solid_angle") -> list
 
 
 def paths(clusters, groups) -> list[list[int]]:
-    """Yield every path from a leaf to a root as clusters; it passes through one of the
-    clusters that a group made."""
+    """Yield every path from a leaf to a root as a list of clusters. From each group it
+    contains one of the clusters that the group made."""
     made = {}
     for c, own in enumerate(clusters.own_group):
         made.setdefault(int(own), []).append(c)
@@ -82,11 +82,12 @@ def paths(clusters, groups) -> list[list[int]]:
 
 
 def touches_image(mean: np.ndarray, covariance: np.ndarray, filter_px2: float, camera) -> bool:
-    """Whether a gaussian of opacity 1 reaches alpha 1/255 somewhere in the image.
+    """Return whether a gaussian of opacity 1 reaches alpha 1/255 somewhere in the
+    image.
 
-    mean: (3,) and covariance: (3,3) in camera space. Projection linearised at the mean,
-    with the slope that it is linearised at kept within 0.15 image sizes of the image,
-    as gsplat does.
+    `mean` (3,) and `covariance` (3,3) are in camera space. The projection is linearised
+    at the mean. As in gsplat, the slope of the linearisation is clamped to 0.15 image
+    sizes beyond the image.
     """
     x, y, z = mean
     if z < camera.near:

@@ -1,4 +1,4 @@
-"""Computes the channels of a sensor in float64, with and without meshes: blends every
+"""Computes the channels of a sensor in float64, with and without meshes. Blends every
 gaussian in every pixel, front to back."""
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class Sensed:
     median_depth: np.ndarray  # (H,W)
     normal: np.ndarray  # (H,W,3)
     normal_length: np.ndarray  # (H,W) length of the normal before it is normalised
-    strongest: np.ndarray  # (H,W) index of the gaussian; -1: nothing, -2: the mesh
+    # (H,W) index of the gaussian with the largest weight; -1 for none, -2 for the mesh
+    strongest: np.ndarray
     weight: np.ndarray  # (H,W) largest weight
     second_weight: np.ndarray  # (H,W) second largest weight
     # (H,W) smallest relative distance of a transmittance from a half or from the stop
@@ -118,7 +119,8 @@ def sense(
             coverage, at = float(mesh.coverage[y, x]), float(mesh.depth[y, x])
             mesh_normal, mesh_color = mesh.normal[y, x], mesh.color[y, x]
         front = int((depths < at).sum())
-        if pixel.stopped < front:  # what is in front hides the mesh
+        # the pixel stopped in front of the mesh, which is therefore hidden
+        if pixel.stopped < front:
             coverage = 0.0
         passed = pixel.left[front - 1] if front > 0 else 1.0
         share = np.full(len(depths), (1 - coverage) * pixel.gain)
@@ -146,7 +148,7 @@ def sense(
             out["median_depth"][y, x] = layers[is_dark[0]]
         ranked = np.insert(weights, front, of_mesh)
         names = np.insert(order, front, -2)
-        best = int(np.argmax(ranked))  # the first of equals
+        best = int(np.argmax(ranked))  # the first one of equal values
         if ranked[best] > 0:
             out["strongest"][y, x] = names[best]
             out["weight"][y, x] = ranked[best]

@@ -1,8 +1,8 @@
 """Real spherical harmonics up to degree 3, from their definition by Legendre
 polynomials, in float64.
 
-Order and signs are those of 3DGS files: within degree l the orders m = -l..l, with the
-Condon-Shortley phase.
+Order and signs are those of 3DGS files. Within degree l, the orders are m = -l..l, with
+the Condon-Shortley phase.
 """
 
 from __future__ import annotations
@@ -39,8 +39,6 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
 def color(sh: np.ndarray, directions: np.ndarray, degree: int | None = None) -> np.ndarray:
     """Return (N,3) colours: the series of sh (N,K,3) up to the degree, plus one half,
     at least 0. Values that are not finite become 0.
-
-    What is not finite is 0.
     """
     sh = np.asarray(sh, np.float64)
     if degree is None:

@@ -18,8 +18,9 @@ COLOR_WEIGHT = 6.0
 
 
 def survivors(gaussians, wanted: int) -> list[int]:
-    """V3DG, section 3.2, as in its published code: from each octant around the medians
-    survives its share, the gaussians with the highest opacity and size."""
+    """Return the gaussians that survive pruning (V3DG, section 3.2, as in its published
+    code): from each octant around the medians, its share of the gaussians with the
+    highest opacity and size."""
     count = len(gaussians)
     scales = gaussians.scales.astype(np.float64)
     score = gaussians.opacities * np.prod(scales, axis=1) ** (2 / 3)
@@ -37,8 +38,8 @@ def survivors(gaussians, wanted: int) -> list[int]:
 
 
 def area(scales) -> np.ndarray:
-    """Return the surface area of an ellipsoid divided by 4 pi: the mean area of its
-    shadow along 13 directions, weighted by kind."""
+    """Return the surface area of an ellipsoid divided by 4 pi, computed as the weighted
+    mean area of its shadows along 13 directions."""
     directions = [d for d in itertools.product([-1, 0, 1], repeat=3) if d > (0, 0, 0)]
     weights = {1: 0.0604247, 2: 0.1013528 / 2, 3: 0.5029995 / 4}
     a, b, c = np.moveaxis(np.asarray(scales, np.float64), -1, 0)
@@ -50,7 +51,7 @@ def area(scales) -> np.ndarray:
 
 
 def covariances(gaussians) -> np.ndarray:
-    """(N, 3, 3)."""
+    """Return the covariances (N, 3, 3)."""
     axes = (
         reference_project.rotation(gaussians.quats)
         * gaussians.scales.astype(np.float64)[:, None, :]
@@ -73,7 +74,7 @@ def moments(gaussians) -> SimpleNamespace:
 
 
 def merged(gaussians) -> SimpleNamespace:
-    """Return one gaussian with the moments of all, so opaque that it keeps their area
+    """Return one gaussian with the total moments. Its opacity preserves the sum of area
     times opacity."""
     m = moments(gaussians)
     mean = m.mean / m.weight

@@ -36,7 +36,7 @@ def make_bundle(name, *, seed=0, count=2000, sh_degree=1, opacity=0.9):
     """Write a bundle of a unit ball of gaussians."""
     rng = np.random.default_rng(seed)
     sh = rng.normal(0, 0.4, (count, (sh_degree + 1) ** 2, 3)).astype(np.float32)
-    sh[:, 1:] *= 0.5  # so that few colours are out of range
+    sh[:, 1:] *= 0.5  # keeps most colours within the range
     asset = v3dg.Gaussians(
         means=rng.normal(size=(count, 3)).astype(np.float32) * 0.3,
         quats=rng.normal(size=(count, 4)).astype(np.float32),
@@ -151,7 +151,8 @@ def attributes_are_those_that_blender_draws():
     if not splats.has_splats():
         np.testing.assert_allclose(values(block, "radiance")[:, 3], cut.opacities)
         return
-    # Blender's import of a .ply file with the same gaussians is the witness.
+    # The result is compared with Blender's own import of a .ply file with the same
+    # gaussians.
     v3dg.write_asset("cut.ply", cut)
     bpy.ops.wm.ply_import(filepath=os.path.abspath("cut.ply"))
     witness = bpy.context.object.data
@@ -223,7 +224,7 @@ def the_timer_follows_the_view_and_the_instances():
     sizes = []
 
     def look():
-        watch._state.pace._not_before_s = 0.0  # no pause
+        watch._state.pace._not_before_s = 0.0  # without waiting
         watch.viewports = lambda: [viewport_at(camera)]
         watch._look()
         bpy.context.view_layer.update()
@@ -232,7 +233,7 @@ def the_timer_follows_the_view_and_the_instances():
     try:
         look()
         assert sizes[0][0] == show.show_render(bpy.context.scene, depsgraph()).num_gaussians
-        look()  # nothing has changed
+        look()  # the second call finds no change
         assert sizes[1] == sizes[0]
         camera.location.y = -80
         look()
@@ -315,7 +316,7 @@ def a_scene_comes_back_as_it_was_saved():
         np.testing.assert_allclose(
             getattr(saved, name)[order], getattr(upright, name)[expected_order], rtol=1e-6
         )
-    # The camera has the same view as before, and the size of the render.
+    # The camera shows the same view as before, at the size of the render.
     assert list(cameras) == ["front"]
     np.testing.assert_allclose(cameras["front"].K, view.K, rtol=1e-5)
     seen = in_view(cameras["front"], saved.positions[order])
@@ -668,7 +669,7 @@ def a_missing_package_is_named():
     try:
         for name in modules:
             del sys.modules[name]
-        sys.modules["v3dg"] = None  # which makes its import fail
+        sys.modules["v3dg"] = None  # `import v3dg` then fails
         importlib.import_module("v3dg_blender")
     except ImportError as error:
         message = str(error)

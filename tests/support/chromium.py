@@ -4,7 +4,8 @@ import shutil
 
 PROGRAM = shutil.which("chromium") or shutil.which("google-chrome")
 
-# These draw WebGL in software, and prevent requests to the network.
+# These arguments make Chromium draw WebGL in software, and prevent requests to the
+# network.
 ARGUMENTS = [
     "--no-sandbox",
     "--use-angle=swiftshader",

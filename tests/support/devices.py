@@ -1,5 +1,5 @@
-"""Arrays on either device, NumPy's on the CPU and torch tensors on CUDA, for tests that
-run on both."""
+"""Arrays on either device, for tests that run on both: NumPy arrays on the CPU, and
+torch tensors on CUDA."""
 
 import contextlib
 
@@ -9,8 +9,8 @@ from v3dg import Gaussians
 
 
 def on(device, value):
-    """Return the array or the gaussians on `device`; a tuple or list of them becomes a
-    tuple."""
+    """Return the array or the gaussians on `device`. A tuple or a list of these becomes
+    a tuple."""
     if isinstance(value, (tuple, list)):
         return tuple(on(device, v) for v in value)
     if device == "cpu":
@@ -25,8 +25,7 @@ def on(device, value):
 
 
 def host(value):
-    """Return the same as NumPy arrays: of an array, gaussians, or a tuple or list of
-    them."""
+    """Return an array, gaussians, or a tuple or list of these, as NumPy arrays."""
     if isinstance(value, (tuple, list)):
         return tuple(host(v) for v in value)
     if isinstance(value, Gaussians):

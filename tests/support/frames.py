@@ -18,7 +18,7 @@ render = functools.partial(v3dg.render, depth=True)
 
 
 class Renderer(v3dg.Renderer):
-    """Draws depth, too, so that tests compare it."""
+    """A renderer that also draws depth, so that tests compare it."""
 
     def render(self, camera, **options):
         return super().render(camera, **{"depth": True} | options)

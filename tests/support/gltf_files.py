@@ -1,4 +1,4 @@
-"""glTF files of gaussians, made part by part, so that a test can change any part."""
+"""glTF files of gaussians, built from parts so that a test can change any part."""
 
 import base64
 import json
@@ -30,7 +30,7 @@ class GltfFile:
         }
 
     def view(self, content, **fields):
-        """The number of a new buffer view with these bytes."""
+        """Return the index of a new buffer view with these bytes."""
         self.blob += bytes(-len(self.blob) % 4)
         view = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(content), **fields}
         self.blob += content
@@ -38,18 +38,20 @@ class GltfFile:
         return len(self.document["bufferViews"]) - 1
 
     def accessor(self, values, kind=FLOAT, **fields):
-        """The number of a new accessor of values (N, width) in a view of their own."""
+        """Return the index of a new accessor of values (N, width) in a separate
+        view."""
         rows = np.asarray(values).reshape(len(values), -1).astype(DTYPES[kind])
         return self.bare_accessor(rows, kind, bufferView=self.view(rows.tobytes()), **fields)
 
     def bare_accessor(self, rows, kind=FLOAT, **fields):
-        """The number of a new accessor for values of this shape."""
+        """Return the index of a new accessor without a view, for values of this
+        shape."""
         accessor = {"componentType": kind, "count": len(rows), "type": TYPES[rows.shape[1]]}
         self.document["accessors"].append({**accessor, **fields})
         return len(self.document["accessors"]) - 1
 
     def attributes(self, gaussians, prefix=f"{NAME}:"):
-        """The attributes of gaussians, by name."""
+        """Return the attributes of gaussians by name."""
         names = [f"SH_DEGREE_{d}_COEF_{n}" for d in range(4) for n in range(2 * d + 1)]
         values = {
             "POSITION": gaussians.means,
@@ -62,12 +64,12 @@ class GltfFile:
         return {name: self.accessor(array) for name, array in values.items()}
 
     def primitive(self, attributes, **properties):
-        """A primitive of gaussians with these attributes."""
+        """Return a primitive of gaussians with these attributes."""
         extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", **properties}
         return {"mode": 0, "attributes": attributes, "extensions": {NAME: extension}}
 
     def mesh(self, *parts):
-        """The number of a new mesh of gaussians, or of primitives."""
+        """Return the index of a new mesh of gaussians, or of primitives."""
         primitives = [
             part if isinstance(part, dict) else self.primitive(self.attributes(part))
             for part in parts
@@ -81,7 +83,8 @@ class GltfFile:
         return self
 
     def write(self, path, uri=None):
-        """Write a `.glb`; or a `.gltf` whose buffer is in a data: URI, or in a file."""
+        """Write a `.glb`, or a `.gltf` whose buffer is in a data: URI or in a separate
+        file."""
         buffer = self.document["buffers"][0]
         buffer["byteLength"] = len(self.blob)
         if path.suffix == ".gltf":
@@ -94,7 +97,7 @@ class GltfFile:
 
 
 def file_of_every_part():
-    """A file with every kind of part that a reader looks at: ten gaussians in two
+    """Return a file with every kind of part that a reader visits: ten gaussians in two
     meshes."""
     asset = random_gaussians(np.random.default_rng(0), 5, 1)
     file = GltfFile()
@@ -122,7 +125,7 @@ def file_of_every_part():
 
 
 def glb_bytes(document, blob=b""):
-    """A `.glb` with this JSON and these bytes."""
+    """Return the bytes of a `.glb` with this JSON and this binary chunk."""
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     blob += bytes(-len(blob) % 4)

@@ -1,11 +1,12 @@
-"""Half turns about an axis, made without the code that turns what files hold."""
+"""Half turns about an axis, implemented without the package's code that rotates
+gaussians."""
 
 import numpy as np
 
 from v3dg import Gaussians
 
-# The quaternion of a half turn, and the signs of the quaternions of turned gaussians
-# whose own axes turn, too.
+# The quaternion of a half turn, and the signs of the rotated gaussians' quaternions if
+# their own axes are rotated, too.
 _TURNS = {
     "x": ((0, 1, 0, 0), (1, 1, -1, -1)),
     "y": ((0, 0, 1, 0), (1, -1, 1, -1)),

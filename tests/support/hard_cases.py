@@ -48,8 +48,9 @@ class HardCase:
     camera: Camera = PLAIN
     mode: dict[str, Any] = field(default_factory=dict)
     picture: PictureBound = PICTURE_FLOAT
-    gradient: GradientBound | None = GRADIENT_FLOAT  # None: the number of sides is unlimited
-    is_drawn: bool = True  # at least one pixel
+    # None means that the gradient has to be finite, without a bound for its error.
+    gradient: GradientBound | None = GRADIENT_FLOAT
+    is_drawn: bool = True  # whether at least one pixel is drawn
 
 
 def crowd(
@@ -328,7 +329,7 @@ def hard_cases() -> dict[str, HardCase]:
     return {**shapes(), **values(), **places(), **cameras()}
 
 
-# These functions measure.
+# The functions below measure errors.
 
 
 def picture(case: HardCase, device: str) -> v3dg.Image:
@@ -364,11 +365,11 @@ def drawn_rows(case: HardCase) -> np.ndarray:
 def gradients(
     case: HardCase, draw: Callable[..., Any], dtype: Any, device: str = "cpu"
 ) -> list[np.ndarray]:
-    """Return the gradients by the five inputs of a number that depends on every pixel
-    of colour, alpha and depth.
+    """Return the gradients, with respect to the five inputs, of a number that depends
+    on every pixel of colour, alpha and depth.
 
-    `draw` takes the five inputs as tensors, the camera and the mode. Depth counts in
-    units of the nearest one.
+    `draw` takes the five inputs as tensors, the camera and the mode. Depth is divided
+    by the depth of the nearest gaussian.
     """
     import torch
 
@@ -397,7 +398,7 @@ def relative_changes(case: HardCase, by_inputs: Sequence[np.ndarray]) -> list[np
     """Return gradients by relative changes: of a mean by its distance, of a scale by
     itself, and so on.
 
-    They can be compared with each other for scenes of any size. The gradient of NaN
+    These gradients can be compared between scenes of any size. The gradient of NaN
     inputs is 0.
     """
     g = case.gaussians

@@ -1,4 +1,4 @@
-"""Generates the TypeScript types of the viewer's page from the messages in Python.
+"""Generates the TypeScript types of the viewer's web page from the messages in Python.
 
 `python tests/support/page_protocol.py` writes `v3dg/viewer/page/protocol.d.ts`. A test
 compares that file with the messages.

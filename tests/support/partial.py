@@ -16,7 +16,7 @@ def closed_residency(rng, bundle, share=None):
     share = rng.choice([0.0, 0.5, 0.8, 0.95, 1.0]) if share is None else share
     parent = bundle.groups.parent
     there = np.append(rng.random(len(parent)) < share, True)
-    for g in range(len(parent) - 1, -1, -1):  # parents come later in the table
+    for g in range(len(parent) - 1, -1, -1):  # parents have larger indices
         there[g] &= there[parent[g]]
     return there
 
@@ -49,7 +49,7 @@ def random_begins(rng, bundle):
     and a frame in which some fade."""
     parent = bundle.groups.parent
     begins = np.full(len(parent) + 1, LONG_AGO, np.int32)
-    for g in range(len(parent) - 1, -1, -1):  # parents come later in the table
+    for g in range(len(parent) - 1, -1, -1):  # parents have larger indices
         above = int(begins[parent[g]])
         if above == NEVER or rng.random() < 0.05:
             begins[g] = NEVER

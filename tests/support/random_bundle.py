@@ -23,9 +23,9 @@ def random_gaussians(rng, count, sh_degree=0):
 def random_links(rng, num_levels, max_fan=3):
     """Return own and parent group and level of clusters, and parent and level of
     groups, from the last level down."""
-    # Each cluster of the last level is (own, parent), to be numbered later.
+    # Each cluster of the last level is a pair (own, parent), numbered later.
     levels = [[(-1, -1)] * int(rng.integers(1, max_fan + 1))]
-    groups = []  # per level, from the last one: (parent, number of clusters below)
+    groups = []  # for each level from the last one: (parent, number of clusters below)
     for _ in range(num_levels - 1):
         clusters, made = levels[-1], []
         owners = []
@@ -41,7 +41,8 @@ def random_links(rng, num_levels, max_fan=3):
     groups.reverse()
     first = np.concatenate([[0], np.cumsum([len(made) for made in groups])]).astype(int)
 
-    def number(g, level):  # returns the index of group g among those that make `level`
+    # returns the index of group g among the groups that make `level`
+    def number(g, level):
         return -1 if g < 0 else first[level - 1] + g
 
     rows = [

@@ -1,4 +1,4 @@
-"""Small places that surround the viewer."""
+"""Small scenes that surround the viewer: rooms and streets."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ import v3dg
 
 
 def box(rng, low, high, density=100.0, sides="xXyYzZ"):
-    """Return points that are evenly distributed on sides of a box: x is the low side
-    across the x axis, X the high one."""
+    """Return points that are evenly distributed on sides of a box. In `sides`, x is the
+    low side across the x axis, and X the high one."""
     borders = np.array([low, high], float)
     points = []
     for side in sides:

@@ -30,7 +30,7 @@ def covariances(gaussians):
 
 
 def box_of(gaussians):
-    """Return (2,3) float32, rounded outwards: the box of means plus reach."""
+    """Return the box (2,3) of means and their extents, in float32, rounded outwards."""
     if len(gaussians) == 0:
         return np.zeros((2, 3), np.float32)
     reach = REACH * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
@@ -65,8 +65,8 @@ def lod_bundle(rng, asset, cluster_size, *, group_size=2, past_root=2, filter_px
     halvings = _core.num_halvings(len(asset), cluster_size)
     order, leaf_offset = _core.median_split(asset.means, np.array([0, len(asset)]), halvings)
     level = [asset.subset(order[a:b]) for a, b in itertools.pairwise(leaf_offset)]
-    # A unit is: the clusters made by one group, that group (-1: none), and the ball
-    # that must be contained.
+    # A unit is a tuple of the clusters that one group made, that group (-1 for none),
+    # and the ball that must be contained.
     units = [([cluster], -1, None) for cluster in level]
     clusters, balls, weights, group_level, group_parent, links = [], [], [], [], [], []
     depth = 0

@@ -53,10 +53,11 @@ if __name__ == "__main__":
     program, *arguments = sys.argv[1:]
     if program == "benchmarks":
         sys.exit(benchmarks.PROGRAM.main(arguments))
-    if arguments[0] == "view":  # it serves until it is interrupted, so only its options are checked
+    # the server runs until it is interrupted, so only its options are checked
+    if arguments[0] == "view":
         cli.parse(arguments)
         sys.exit()
-    views = ["--views", "2"]  # for a turntable, which a scene does not have
+    views = ["--views", "2"]  # a scene has no turntable, so the option is left out
     if arguments[0] != "compare" or any(argument.endswith(".json") for argument in arguments):
         views = []
     sys.exit(cli.main([*arguments, *OPTIONS.get(arguments[0], []), *views]))

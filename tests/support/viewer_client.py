@@ -1,5 +1,5 @@
-"""The page's side of the viewer's connection: it moves a camera, changes settings, and
-receives pictures."""
+"""A client that plays the web page's side of the viewer's connection: it moves a
+camera, changes settings, and receives pictures."""
 
 import io
 import json
@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 
 class Tab:
-    """A browser tab from the view of the server.
+    """A browser tab, as the server sees it.
 
     Attributes:
         hello, scene: The first messages of the server.

@@ -1,4 +1,4 @@
-"""Pages that draw given cuts with the renderer for browsers, for tests."""
+"""Web pages for tests that draw given cuts with the renderer for browsers."""
 
 import base64
 import contextlib
@@ -16,7 +16,7 @@ from v3dg import export
 from v3dg.bundle.format import HASH_BYTES, hash_of_pieces
 
 WEB = Path(export.__file__).parent / "web"
-# What tests need that draw in Chromium.
+# Marks for tests that draw in Chromium.
 NEEDS = [
     pytest.mark.skipif(chromium.PROGRAM is None, reason="chromium is not installed"),
     pytest.mark.skipif(
@@ -27,7 +27,7 @@ NEEDS = [
         reason="the core for web pages is not compiled: python csrc/wasm/build.py",
     ),
 ]
-# WebGPU in software.
+# These arguments make Chromium use WebGPU in software.
 ARGUMENTS = [
     "--enable-unsafe-webgpu",
     "--use-webgpu-adapter=swiftshader",
@@ -148,7 +148,7 @@ def spoil_page(data, page):
 
 
 def write_page(folder):
-    """Write a page to a folder in which drawing() draws."""
+    """Write the web page that drawing() opens to a folder."""
     shutil.copytree(WEB, folder / "web")
     (folder / "index.html").write_text(PAGE)
     (folder / "draw.js").write_text(SCRIPT)

@@ -13,7 +13,7 @@ class Server(http.server.ThreadingHTTPServer):
 
     Attributes:
         requests: The path and the Range header of each request; None without one.
-        has_ranges: Whether ranges are answered; otherwise whole files are.
+        has_ranges: Whether ranges are supported; otherwise whole files are sent.
         is_lost: Whether connections are closed without an answer.
         accepts: Names of files that a page may write.
     """

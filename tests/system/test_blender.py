@@ -1,7 +1,8 @@
-"""Runs the tests of the add-on inside Blender, which are in blender_session.py.
+"""The tests of the Blender add-on. blender_session.py has the checks, which run inside
+Blender.
 
-Blender as a Python module is large and needs a certain version of Python. So these
-tests use the Python that V3DG_BLENDER_PYTHON names if this one has no module bpy:
+Blender as a Python module is large and needs a certain version of Python. If this
+Python has no module bpy, the tests use the one that V3DG_BLENDER_PYTHON names:
 
     python3.13 -m venv blender
     blender/bin/pip install bpy pillow tqdm tyro zstandard

@@ -78,7 +78,7 @@ def ball_around(gaussians):
 
 
 def camera_at(center, radius, direction, footprint_px2):
-    """Return a camera four radii away for which the ball covers about this area in
+    """Return a camera four radii away that sees the ball with about this area in
     px²."""
     side = max(4, math.ceil(2.2 * math.sqrt(footprint_px2 / math.pi)))
     fov = 2 * math.atan(1.1 * math.tan(math.asin(1 / 4)))
@@ -89,8 +89,8 @@ def camera_at(center, radius, direction, footprint_px2):
 
 
 def held_out_psnr(asset, bundle, level):
-    """Return the PSNR of a level, drawn as large as it is selected, relative to the
-    supersampled asset."""
+    """Return the PSNR of a level relative to the supersampled asset, at the size at
+    which the level is selected."""
     gaussians, (center, radius) = bundle.level_gaussians(level), ball_around(asset)
     first = bundle.level_range(level).start
     options = {
@@ -106,7 +106,7 @@ def held_out_psnr(asset, bundle, level):
     return -10 * math.log10(np.mean(errors))
 
 
-# ---- the same build
+# ---- builds that give the same bytes
 
 
 THREADS_SCRIPT = """
@@ -196,7 +196,7 @@ def test_build_runs_on_the_callers_stream(asset):
     assert same(bundle, build(asset, device="cuda"))
 
 
-# ---- what it is made of
+# ---- clusters, filters and colours of levels
 
 
 @pytest.mark.parametrize("num_gaussians", [1000, 1023, 1025])
@@ -329,8 +329,8 @@ def test_smoothness_is_measured_where_levels_are_fitted_with_a_filter(changes, i
 @pytest.mark.parametrize("num_gaussians", [8192, 8193, 8200, 9000, 700])
 @pytest.mark.parametrize(("missed", "is_smooth"), [(1.47, True), (1.48, False)])
 def test_smoothness_is_measured_all_over_the_asset(num_gaussians, missed, is_smooth, monkeypatch):
-    """This also holds if groups have one gaussian more than a round number; the
-    clusters of a sample could be larger."""
+    """This also holds if groups have one gaussian more than a round number, in which
+    case the clusters of a sample could be larger."""
     asset = make_asset(num_gaussians=1000, seed=0).subset(np.arange(num_gaussians) % 1000)
     config = BuildConfig(cluster_size=64, group_size=4, steps=7, loss_l1=2.0, loss_alpha=0.25)
     leaves = MemoryLeaves(asset, config)
@@ -379,7 +379,7 @@ def test_level_zero_is_the_asset(asset, bundle):
 @pytest.mark.parametrize("codec", ["float32", "quantized"])
 @pytest.mark.parametrize("config", [BuildConfig(steps=2), BuildConfig.paper(steps=2)])
 def test_neighbours_stand_together_in_the_clusters_of_every_level(config, codec, device):
-    # The paper's clusters are split after the fit.
+    # In the configuration of the paper, clusters are split after the fit.
     config = replace(config, cluster_size=100, group_size=4)
     asset = make_asset(num_gaussians=1500, seed=3)
     bundle = build(asset, config, codec=codec, device=device)
@@ -390,8 +390,8 @@ def test_neighbours_stand_together_in_the_clusters_of_every_level(config, codec,
 
 
 def test_the_filter_of_an_asset_is_its_own(asset, bundle, device):
-    """Level 0 is drawn with it. Coarser levels are fitted to the asset without a
-    filter; otherwise they would be thicker."""
+    """Level 0 is drawn with the filter of the asset. Coarser levels are fitted to the
+    asset without a filter; otherwise they would be thicker."""
     filtered = build(asset, replace(SMALL, asset_filter_px2=0.3), device=device)
     is_fine = bundle.clusters.level == 0
     assert (filtered.clusters.filter_px2[is_fine] == np.float32(0.3)).all()
@@ -426,7 +426,7 @@ def test_boxes_hold_all_that_is_drawn(asset, moved, device):
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # At this distance, alpha is 1/255.
+    # At this number of standard deviations, alpha is 1/255.
     sigmas = np.sqrt(2 * np.log(np.maximum(255 * g.opacities.astype(np.float64), 1)))
     axes = reference_project.rotation(g.quats) * (g.scales * sigmas[:, None])[:, None, :]
     points = g.means[:, None, :] + directions @ axes.transpose(0, 2, 1)
@@ -445,15 +445,15 @@ def test_colours_of_all_degrees_survive_to_the_coarsest_level(degree, device):
     bundle = build(asset, replace(SMALL, steps=0), device=device)
     last = bundle.level_gaussians(bundle.num_levels - 1)
     np.testing.assert_allclose(last.sh, asset.sh[: len(last)], rtol=1e-5, atol=1e-6)
-    # The fit compensates for lost overlap with brightness, but has no reason to change
-    # coefficients that depend on the direction.
+    # The fit makes gaussians brighter to compensate for lost overlap, but has no reason
+    # to change coefficients that depend on the direction.
     fitted = build(asset, device=device)
     assert fitted.sh_degree == degree
     fitted_last = fitted.level_gaussians(fitted.num_levels - 1)
     np.testing.assert_allclose(fitted_last.sh.mean(axis=0)[1:], asset.sh[0, 1:], atol=0.1)
 
 
-# ---- any asset
+# ---- unusual assets
 
 
 def degenerate_assets():
@@ -643,10 +643,10 @@ def number_of(field):
 
 
 def test_every_number_has_a_range_in_which_a_build_ends(asset):
-    """Each setting takes either end of its range, with defaults for the rest: the asset
-    is built, or the settings are refused before memory is allocated."""
+    """Each setting in turn takes either end of its range. The asset is then built, or
+    the settings are refused before memory is allocated."""
     small = BuildConfig(cluster_size=32, steps=1, num_views=2, asset_filter_px2=0.0)
-    # Settings without a range.
+    # All settings that are numbers must have a range.
     assert not {field.name for field in fields(BuildConfig) if field.type in (int, float)}
     numbers = {field.name: number_of(field) for field in fields(BuildConfig)}
     ranges = {name: get_args(kind)[1] for name, kind in numbers.items() if kind is not None}
@@ -717,8 +717,8 @@ def test_paper_fit_reduces_the_error(asset, device):
 def test_fit_is_never_worse_than_its_start(asset, device):
     config = replace(SMALL, num_views=16)
     start = build(asset, replace(config, steps=0), device=device).groups
-    # The steps are so long that fits diverge. The fits of the first level have the same
-    # start in all builds.
+    # The steps are so long that fits diverge. All builds begin the fits of the first
+    # level alike.
     for change in (
         {},
         {"step_position": 10.0, "step_logit": 50.0},
@@ -745,8 +745,8 @@ def test_runaway_fit_leaves_the_start(asset, device):
 
 
 def test_fit_gains_over_merging_alone(asset, device):
-    """The gain is in dB at the size of selection, in views that no fit saw. Measured:
-    1.5, 1.5, 0.7."""
+    """The gain in dB is measured at the size of selection, in views that no fit used.
+    Measured: 1.5, 1.5, 0.7."""
     merged, fitted = (
         build(asset, BuildConfig(cluster_size=64, steps=steps), device=device) for steps in (0, 200)
     )
@@ -758,8 +758,8 @@ def test_fit_gains_over_merging_alone(asset, device):
 
 
 def test_progress_counts_all_levels_ahead(asset, device):
-    """At the end the progress is complete: all coarser gaussians, all levels, the last
-    group and its loss."""
+    """At the end the progress is complete: all gaussians of coarser levels, all levels,
+    and the last group with its loss."""
     told = []
     config = replace(SMALL, group_size=4)
     bundle = build_bundle(

@@ -1,4 +1,5 @@
-"""Builds on executors: processes, and a dask cluster of which a worker is killed."""
+"""Builds that run on executors: on processes, and on a dask cluster in which a worker
+is killed."""
 
 import asyncio
 import multiprocessing
@@ -28,7 +29,7 @@ PATIENCE = 120
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An asset of 16 units, and its bundle as one process builds it."""
+    """An asset of 16 units, and the bundle that a single process builds from it."""
     folder = tmp_path_factory.mktemp("cluster")
     v3dg.write_asset(folder / "a.ply", make_asset(num_gaussians=6000, seed=0))
     with small_units():
@@ -38,7 +39,7 @@ def folder(tmp_path_factory):
 
 @contextmanager
 def small_units():
-    """Set the size of units in the driver only: workers receive it in the plan of their
+    """Set the size of units in the driver only. Workers receive it in the plan of their
     unit."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("v3dg.levels.whole.UNIT_LEAVES", 500)
@@ -61,7 +62,7 @@ def spawned_processes(count):
 
 @pytest.fixture
 def at_package(monkeypatch):
-    """Make spawned processes find the package under test."""
+    """Let spawned processes import the package under test."""
     monkeypatch.setenv("PYTHONPATH", PACKAGE)
 
 
@@ -105,7 +106,7 @@ def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, a
 
 
 def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch):
-    """The build continues where one process was interrupted."""
+    """The executor continues a build that was interrupted in one process."""
     output = tmp_path / "out.v3dg"
     left = [8]
     simplify = v3dg.levels.simplify.LevelBuilder._simplify
@@ -156,7 +157,8 @@ def test_workers_that_do_not_reach_the_folder_say_so(folder, tmp_path, at_packag
 
 
 class Interrupted(Executor):
-    """Finishes two units, accepts three more, and is interrupted."""
+    """An executor that finishes two units, accepts three more, and is then
+    interrupted."""
 
     def __init__(self):
         self.futures = []
@@ -187,13 +189,14 @@ def test_an_interrupt_cancels_what_waits(folder, tmp_path):
 
 
 def is_journal_longer(output, folder):
-    """Return whether a unit is finished."""
+    """Return whether the journal contains a finished unit."""
     path = levels_path(output)
     return path.exists() and path.stat().st_size > (folder / "local.v3dg").stat().st_size
 
 
 class Killer:
-    """Kills the process whose number a function returns, as soon as it returns one."""
+    """A thread that kills a process as soon as a function returns the process's
+    number."""
 
     def __init__(self, victim):
         self.killed = None
@@ -219,7 +222,7 @@ class Killer:
 
 @contextmanager
 def cluster(folder, num_workers):
-    """The address of a scheduler, and of workers in separate processes."""
+    """The addresses of a scheduler and of workers in separate processes."""
     environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1", "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "0"}
     options = {
         "cwd": folder,
@@ -293,7 +296,7 @@ def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, 
             build_on(client.get_executor(), folder, output)
         assert killer.killed in pids.values()
         assert len(client.scheduler_info()["workers"]) == 3
-        # The command submits whole units, too.
+        # The command also submits whole units.
         address = client.scheduler.address
         for name, options in (("dask", ["--scheduler", address]), ("here", [])):
             done = run(
@@ -304,7 +307,7 @@ def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, 
 
 
 class Meddler(threading.Thread):
-    """Does something to a scheduler as soon as a unit is finished."""
+    """A thread that stops or kills a scheduler as soon as a unit is finished."""
 
     def __init__(self, output, folder, action):
         super().__init__(daemon=True)
@@ -319,8 +322,8 @@ class Meddler(threading.Thread):
 
 @pytest.fixture
 def meddled_build(folder, tmp_path):
-    """Build on a cluster to whose scheduler something is done meanwhile; return also
-    its address."""
+    """Build on a cluster whose scheduler is disturbed meanwhile. Return also its
+    address."""
     distributed = pytest.importorskip("distributed")
     (tmp_path / "dask").mkdir()
     (tmp_path / "out").mkdir()
@@ -337,12 +340,13 @@ def meddled_build(folder, tmp_path):
         yield build, output, address
         begin = time.monotonic()
         client.close()
-        assert time.monotonic() - begin < 30  # also with a scheduler that does not answer
+        # the build also ends if the scheduler does not answer
+        assert time.monotonic() - begin < 30
 
 
 def goes_on_alone(folder, output):
-    """Return whether finished units exist, from which a build continues without the
-    scheduler."""
+    """Return whether finished units exist, so that a build without the scheduler can
+    continue from them."""
     assert levels_path(output).exists()
     with ThreadPoolExecutor(2) as executor:
         build_on(executor, folder, output, resume=True)
@@ -386,7 +390,7 @@ def test_a_scheduler_that_dies_in_the_midst_is_named(meddled_build, folder):
 
 
 class Client:
-    """A client whose scheduler answers as often as it is told to."""
+    """A client of a scheduler that answers only some of the requests."""
 
     status = "running"
 
@@ -494,7 +498,8 @@ def test_what_is_no_address_is_told_so(address):
 
 
 def test_a_lost_scheduler_ends_a_run_over_many_assets(tmp_path, monkeypatch):
-    """Otherwise each of the other assets would wait as long for it."""
+    """If the run continued, each of the other assets would wait as long for the
+    scheduler."""
     from v3dg.cli import main
 
     built = []

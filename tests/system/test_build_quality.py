@@ -1,5 +1,5 @@
-"""Builds that end with a refinement: when they do, what stays unchanged, and what an
-interrupted refinement leaves."""
+"""Builds that end with a refinement: which builds do, what stays unchanged, and what an
+interrupted refinement leaves behind."""
 
 import os
 import re
@@ -51,7 +51,7 @@ def asset():
 
 @pytest.fixture
 def short(monkeypatch):
-    """Make refinements use few pictures."""
+    """Make refinements short by using few pictures."""
     monkeypatch.setattr("v3dg.levels.quality._LEAST_PICTURES", STEPS)
     monkeypatch.setattr("v3dg.levels.quality._GAUSSIANS_PER_PICTURE", 1 << 40)
     monkeypatch.setattr("v3dg.levels.refined._NUM_WEIGHING_PICTURES", 40)
@@ -86,7 +86,8 @@ def names_in(folder):
         ("standard", 500_000, 3, 23_000),
         ("standard", 4_000_000, 0, 58_000),
         ("best", 500_000, 0, 115_000),
-        # Four units of 2.5 million, and eight of 1.25 million.
+        # An asset of 10 million gaussians has four units of 2.5 million, or eight of
+        # 1.25 million.
         ("standard", 10_000_000, 0, 43_000),
         ("standard", 10_000_000, 3, 30_500),
         ("best", 10_000_000, 0, 215_000),
@@ -126,7 +127,8 @@ def test_level_0_stays(short, asset, device):
 
 
 def test_workers_do_not_change_the_bytes(short, file, device, tmp_path, monkeypatch):
-    """Neither their number nor storing the levels in a file changes the bytes."""
+    """Neither the number of workers nor storing the levels in a file changes the
+    bytes."""
     monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 300)
     expected = bytes_of(refined_by_hand(file, device), tmp_path)
     output = tmp_path / "out.v3dg"
@@ -160,7 +162,7 @@ MOMENTS = {
 def test_a_refinement_that_is_interrupted_begins_again(
     short, file, device, tmp_path, monkeypatch, moment
 ):
-    """The levels stay as they are built, as a bundle, and are not built again."""
+    """The levels remain as a complete bundle, and are not built again."""
     expected = bytes_of(refined_by_hand(file, device), tmp_path)
     output = tmp_path / "out.v3dg"
 
@@ -191,7 +193,7 @@ def test_a_refinement_that_is_interrupted_begins_again(
 
 
 def test_a_build_that_is_killed_leaves_its_levels(file, device, tmp_path):
-    """The refinement of 18,010 pictures is far from its end."""
+    """A refinement with 18,010 pictures is far from its end when it is killed."""
     output = tmp_path / "out.v3dg"
     roots = [str(Path(path).parents[1]) for path in (v3dg.__file__, Path(__file__).parent)]
     roots.append(os.environ.get("PYTHONPATH", ""))
@@ -227,7 +229,7 @@ def is_bundle(path):
 
 
 def test_levels_at_a_path_stay_as_they_are_built(short, asset, device, tmp_path):
-    """A build with another quality then continues from them."""
+    """A build with another quality then continues from the finished levels."""
     levels = tmp_path / "levels"
     options = {"config": QUICK, "device": device, "progress": False, "resume_path": levels}
     bundle = build_bundle(asset, quality="standard", **options)
@@ -281,7 +283,8 @@ def test_a_wrong_quality_is_refused(asset):
 
 
 class SmallGpu:
-    """A device that claims to be a GPU, for choices that are made before it is used."""
+    """A device that claims to be a GPU, which suffices for choices that are made before
+    anything is computed on it."""
 
     is_cuda = True
 
@@ -301,8 +304,9 @@ class SmallGpu:
 def test_a_build_is_refined_by_default_where_that_is_quick(
     monkeypatch, config, is_gpu, num_gaussians, memory, expected
 ):
-    """This holds on a GPU with enough memory, of which an asset in units needs no more
-    than a unit does. Otherwise the reason is printed."""
+    """A build is refined on a GPU with enough memory. An asset that is built in units
+    needs no more memory than one unit. If a build is not refined, the reason is
+    printed."""
     monkeypatch.setattr("v3dg.levels.default_quality.free_on", lambda _: 2_700_000_000)
     device = SmallGpu() if is_gpu else CPU
     leaves = SimpleNamespace(num_gaussians=num_gaussians, sh_degree=0)
@@ -337,7 +341,7 @@ def test_viewpoints_of_a_draft_are_refused(asset):
 def test_a_build_of_a_room_says_from_where_it_is_seen(
     short, tmp_path, monkeypatch, capsys, seen_from
 ):
-    """The viewpoints are kept if the build continues."""
+    """The recorded viewpoints are kept if the build is continued."""
     monkeypatch.setattr("v3dg.cli.build.BuildConfig", lambda: QUICK)
     file = tmp_path / "room.ply"
     v3dg.write_asset(file, room())
@@ -356,8 +360,8 @@ def test_a_build_of_a_room_says_from_where_it_is_seen(
 
 
 def test_the_command_builds_each_quality(short, file, tmp_path, capsys):
-    """For a draft that nobody requested, it prints the command that refines it, and how
-    long that takes."""
+    """If a draft was built without being requested, the command prints how to refine
+    it, and how long that takes."""
     output = tmp_path / "a scene.v3dg"
     for quality in (None, "draft", "standard"):
         command.run(

@@ -28,7 +28,8 @@ from v3dg.levels.digest import digest_of
 from v3dg.levels.unfinished import _open_locked
 
 CONFIG = BuildConfig(cluster_size=32, steps=400, first_steps=400)
-# This build would run for days; only the checkpoint of the first level could end it.
+# This build would run for days, so it can only have stopped at the checkpoint of the
+# first level.
 ENDLESS = replace(CONFIG, steps=1_000_000, first_steps=1_000_000)
 SCRIPT = """
 import sys
@@ -51,7 +52,8 @@ bundle.write(sys.argv[3])
 """
 # With fewer bytes in the journal, only leaves may be finished.
 TWO_RECORDS = 3700
-# This is generous: a build that ignored the interrupt would take days.
+# This limit in seconds is generous, because a build that ignored the interrupt would
+# take days.
 PATIENCE = 60
 
 
@@ -77,8 +79,8 @@ def whole(asset, device, tmp_path_factory):
 
 @contextmanager
 def started_build(config, device, folder):
-    """Start a build in a separate process, which is killed at the end if it still
-    runs."""
+    """Start a build in a separate process. It is killed at the end of the test if it
+    still runs."""
     roots = os.pathsep.join(
         str(Path(file).parents[1]) for file in (v3dg.__file__, Path(__file__).parent)
     )
@@ -90,7 +92,7 @@ def started_build(config, device, folder):
         env=environment,
         stdout=subprocess.PIPE,
         text=True,
-        # The same settings as from a terminal, however the tests were started.
+        # Signals are handled as in a terminal, however the tests were started.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     try:
@@ -221,7 +223,10 @@ FINISHING = {
 def test_a_kill_while_it_becomes_a_bundle_loses_nothing(
     asset, checkpoint, expected, place, moment, monkeypatch
 ):
-    """It is killed before or after any of the steps, and nothing is built again."""
+    """The process is killed before or after any of the steps.
+
+    No level is built again.
+    """
     target, calls = FINISHING[place]
     *_, name = target.split(".")
     original = {
@@ -284,8 +289,8 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
     rng = np.random.default_rng(0)
     damaged = {"text": b"not levels", "zeros": bytes(1000), "archive": b"PK\x03\x04" + bytes(1000)}
     pages, journal = rng.integers(0, len(expected), 30), rng.integers(len(expected), len(good), 30)
-    # The first bytes, pages, and the journal, whose end consists mainly of numbers of
-    # clusters and digests.
+    # Places in the header, the pages and the journal. The end of the journal consists
+    # mainly of numbers of clusters and digests.
     for place in (
         *range(0, 42, 7),
         *pages,
@@ -302,8 +307,8 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
             build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
         except ValueError as error:
             refused.append(str(error))
-        # This size makes a level look truncated, or is at the place of the header and
-        # the tables.
+        # The new size makes a level look truncated, or is stored where the header and
+        # the tables begin.
         else:
             assert checkpoint.read_bytes() == expected, damage
     assert len(refused) > len(damaged) / 2
@@ -359,8 +364,8 @@ def test_the_digest_of_an_asset_is_the_one_of_the_format_page():
 
 @pytest.mark.parametrize("target", ["absent", "levels of another", "text"])
 def test_links_at_the_levels_are_refused(asset, checkpoint, tmp_path, target):
-    """They are neither written through nor removed, because they may lead to
-    anything."""
+    """Links in the place of the levels are neither written through nor removed, because
+    they may lead anywhere."""
     checkpoint.rename(tmp_path / "levels of another")
     (tmp_path / "text").write_bytes(b"")
     before = {name: (tmp_path / name).read_bytes() for name in names_in(tmp_path)}
@@ -382,8 +387,8 @@ def test_levels_are_for_their_owner_alone(checkpoint):
 
 
 def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
-    """If a build ends and removes the file that another build has opened, the lock of
-    the latter would protect nothing."""
+    """If a build ends and removes the file that another build has opened, a lock on
+    this file would no longer protect anything."""
     path = tmp_path / "levels"
 
     def lock(descriptor, name):
@@ -467,7 +472,7 @@ def test_a_full_disk_leaves_what_can_be_gone_on_with(asset, checkpoint, expected
         assert checkpoint.read_bytes() == expected
 
 
-# ---- files that do not fit in memory
+# ---- assets that do not fit in memory
 
 
 @pytest.fixture(scope="module")
@@ -497,8 +502,8 @@ def bounded(tiles, monkeypatch):
 
 
 def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, monkeypatch):
-    """The first write, the last write and some in between of each kind fail after half
-    of their bytes."""
+    """Of each kind of write, the first, the last and some in between fail after half of
+    their bytes."""
     write, kinds = _files.write_at, []
     expected = bounded(tmp_path / "whole.v3dg")
 
@@ -524,7 +529,7 @@ def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, 
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def full(descriptor, data, offset):
-        # The head of the file is written again over its own bytes, which needs no room.
+        # The head of the file is overwritten in place, which needs no more space.
         is_head_again = left[0] < 0 and offset == 0
         if is_head_again or kind_of(descriptor, offset) != kind:
             return write(descriptor, data, offset)

@@ -94,9 +94,10 @@ def test_completion_is_a_script_that_knows_commands_and_options(shell):
     assert done.returncode == 0, done.stderr
     assert "compare" in done.stdout
     assert "tolerance" in done.stdout
-    assert "Screen area" not in done.stdout  # help texts, which would flood the terminal
+    # the help text is not printed, because it would fill the terminal
+    assert "Screen area" not in done.stdout
     assert "'None'" not in done.stdout
-    # If nothing else matches, file names are completed.
+    # Names of files are completed if nothing else matches.
     files = {
         "bash": "complete -o default -F",
         "zsh": '-z "$completions"',
@@ -148,7 +149,7 @@ def test_bash_completes_what_the_script_says():
     assert done.stderr == ""
     *completed, registered = done.stdout.splitlines()
     assert completed == ["render", "--tolerance", "x y z -x -y -z", "0"]
-    # Otherwise file names would no longer be completed.
+    # Without this option, bash would no longer complete names of files.
     assert registered == "complete -o default -F _tyro_v3dg v3dg"
 
 
@@ -374,8 +375,8 @@ def test_render_from_a_pool(folder, tmp_path):
 
 
 def test_render_of_a_film_takes_a_budget_in_steps(folder, tmp_path):
-    """The film takes its budget from the part that is free; a still picture takes all
-    of it."""
+    """A film uses only the part of the memory that is free as its budget; a still
+    picture uses all of it."""
     scene, cameras = v3dg.read_scene(folder / "scene.json")
     camera = cameras["near"]
     for fade, budget in ((1.0, 640), (1.02, 640 - 20)):
@@ -499,8 +500,8 @@ def test_wrong_usage(folder):
 @pytest.mark.parametrize("option", [("--views", 1), ("--elevation", 20), ("--up", "z")])
 @pytest.mark.parametrize("command", ["render scene.json", "compare tuft.ply scene.json"])
 def test_options_of_a_turntable_are_refused_beside_cameras(folder, option, command):
-    """Their values do not matter, because a default does not show whether the option
-    was given."""
+    """Options with their default values are refused, too: what counts is whether the
+    user gave the option."""
     message = (
         f"{option[0]}: expected a subject without cameras, got the cameras of scene.json; "
         "leave it out"
@@ -515,8 +516,8 @@ def test_options_of_a_turntable_are_refused_beside_a_camera_file(folder, tmp_pat
 
 
 def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
-    """This holds for all its names: the content of an asset besides its gaussians would
-    be lost."""
+    """Other names of the same file are also refused, because everything in the file
+    besides the gaussians would be lost."""
     (tmp_path / "a.ply").write_bytes((folder / "tuft.ply").read_bytes())
     (tmp_path / "a.v3dg").write_bytes((folder / "tuft.v3dg").read_bytes())
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -534,8 +535,8 @@ def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
 
 
 def test_an_empty_argument_is_not_the_working_folder(folder):
-    """A shell passes an empty argument for an unset variable, and `build` would take
-    all assets in the working folder."""
+    """For an unset variable, a shell passes an empty argument. If it meant the working
+    folder, `build` would build all assets there."""
     before = sorted(os.listdir(folder))
     fails(
         2,
@@ -640,14 +641,14 @@ def test_closed_and_full_streams_end_with_one_line_and_take_no_file(
     assert done.returncode in (0, 1)
     assert done.stderr.count("\n") <= 1
     assert done.stderr.startswith("v3dg: error: " if done.stderr else "")
-    for path in tmp_path.iterdir():  # all output goes to another place
+    for path in tmp_path.iterdir():  # outputs are written to a folder of their own
         np.testing.assert_array_equal(
             v3dg.read_asset(path).means, v3dg.read_asset(folder / "tuft.ply").means
         )
 
 
 def test_text_of_files_reaches_no_terminal_as_it_is(folder, tmp_path):
-    """These are names of files, and texts in a bundle."""
+    """Names of files, and texts in a bundle, may contain control characters."""
     evil = "\x1b]0;owned\x07\x1b[2J\r\n\u202e\x9b\udcff"
     for name in ("{}.ply", "{}.v3dg"):
         shutil.copy(folder / name.format("tuft"), tmp_path / name.format(evil))

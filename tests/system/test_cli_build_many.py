@@ -86,8 +86,8 @@ def test_resume_keeps_what_is_done_with_these_settings(folder):
     assert statuses() == ["built", "built"]
     assert statuses() == ["kept", "kept"]
     assert statuses("--seed", 1) == ["built", "built"]
-    # Dates are not used: some files with other gaussians are older than their bundles,
-    # and some with the same are newer.
+    # The dates of files must not matter, so some files with other gaussians get dates
+    # before those of their bundles, and some with the same gaussians get later ones.
     (folder / "a.ply").rename(folder / "b.ply")
     (folder / "c.ply").rename(folder / "a.ply")
     (folder / "b.ply").rename(folder / "c.ply")
@@ -100,7 +100,7 @@ def test_resume_keeps_what_is_done_with_these_settings(folder):
 
 
 def test_resume_needs_no_format(folder):
-    """The same gaussians in another file are the same asset."""
+    """Files with the same gaussians in different formats are the same asset."""
     assert run("build", "a.ply", "-o", "out.v3dg", *FAST, cwd=folder).returncode == 0
     v3dg.write_asset(folder / "ascii.ply", v3dg.read_asset(folder / "a.ply"), encoding="ascii")
     done = run("build", "ascii.ply", "-o", "out.v3dg", *FAST, "--resume", "--json", cwd=folder)
@@ -120,7 +120,7 @@ def lies(config):
         config | {"asset_digest": 0},
         config | {"build": []},
         config | {"seed": {}},
-        # These are left by earlier builds.
+        # Older versions built bundles without these entries.
         {name: value for name, value in config.items() if name != "asset_digest"},
     ]
 
@@ -198,7 +198,8 @@ def test_errors_before_anything_is_built(folder):
 
 
 def test_several_files_make_one_asset(tmp_path):
-    """This holds with any memory, whether the files are named or their folder."""
+    """This also holds with little memory, and if only the folder of the files is
+    given."""
     parts = [tiny(), tiny()]
     (tmp_path / "tiles").mkdir()
     for name, part in zip("ab", parts, strict=True):

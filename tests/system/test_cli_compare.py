@@ -205,7 +205,8 @@ def chunk(kind, data):
 
 
 def grey_png(side, *chunks, depth=8, rows=1):
-    """Return a grey PNG with any side that has only this number of rows."""
+    """Return a grey PNG that claims a side of any length but has only this number of
+    rows."""
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, depth, 0, 0, 0, 0))
     data = zlib.compress(bytes((1 + side * depth // 8) * rows))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -255,7 +256,7 @@ def test_no_program_is_started_for_a_picture(tmp_path, monkeypatch):
 
 
 def test_more_pictures_in_a_file_are_not_looked_at(tmp_path):
-    """An animation has several pictures, of which the first is compared."""
+    """An animation has several pictures. Only the first is compared."""
     animated = grey_png(8, chunk(b"acTL", bytes(8)), rows=8)
     (tmp_path / "a.png").write_bytes(grey_png(8, rows=8))
     (tmp_path / "b.png").write_bytes(animated)

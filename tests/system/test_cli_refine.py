@@ -34,8 +34,8 @@ def test_a_bundle_is_refined(folder):
 
 
 def test_info_tells_how_levels_were_built_from_how_they_were_refined(folder):
-    """This also holds if a setting has the name and the default of a setting of the
-    build."""
+    """The settings of both are shown, even if a setting of the refinement has the name
+    and the default of one of the build."""
     bundle = v3dg.Bundle.open(folder / "donut.v3dg")
     about = {"refined": {"steps": v3dg.BuildConfig().steps, "drop": 0.1, "seed": 3}}
     config = bundle.config | about
@@ -58,7 +58,7 @@ def test_cameras_say_from_where(folder):
 
 
 def test_lens_distortion_is_left_out_if_told(folder):
-    """Most models of COLMAP have such a lens."""
+    """Most camera models of COLMAP have a lens with distortion."""
     document = json.loads((folder / "eyes.json").read_text())
     (folder / "bent.json").write_text(json.dumps(document | {"camera_model": "OPENCV", "k1": 0.1}))
     command = (

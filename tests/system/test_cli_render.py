@@ -65,7 +65,8 @@ def test_an_eye_alone_looks_at_the_middle(render):
     assert render("--eye", 0, 0, 9, "--up", "y")[0] == 0
     _, _, path = render("--eye", 0, 0, 9, "--up", "y", "--fov", 20)
     rows, columns = np.nonzero(pixels(path).max(axis=2) > 30)
-    # This is the middle of the box, which is not exactly the middle of the blob's rows.
+    # The camera looks at the middle of the bounding box, which is not exactly the
+    # middle of the blob.
     assert abs(rows.mean() - 24) < 8
     assert abs(columns.mean() - 32) < 8
 
@@ -178,7 +179,7 @@ def test_panorama_shows_all_directions(render):
     code, _, path = render(*options, "--projection", "equirectangular", "--background", "white")
     assert code == 0
     covered = (pixels(path) < 250).any(axis=2)
-    assert covered[32, 64]  # ahead
+    assert covered[32, 64]  # the direction ahead is covered
     assert not covered[:, :32].any()
     assert not covered[:10].any()
 

@@ -116,7 +116,7 @@ def test_a_move_to_where_float32_is_coarse_is_told(folder):
 
 
 def test_who_turns_an_asset_is_not_turned_again(folder, asset):
-    """What is written is examined for its up axis again."""
+    """The up axis of the written asset is examined again."""
     _, found = convert(folder, "town.ply", "up.glb", "--rotate", "x:90")
     np.testing.assert_allclose(heights(found, "-y"), heights(asset, "z"), atol=1e-4)
 
@@ -163,7 +163,7 @@ def test_what_a_packed_format_cuts_and_rounds_is_said(folder):
 
 
 def with_faults(asset):
-    """A copy with an invalid position, rotation and scale."""
+    """A copy of the asset with an invalid position, rotation and scale."""
     faulty = v3dg.Gaussians(*(array.copy() for array in vars(asset).values()))
     faulty.means[3] = np.nan
     faulty.quats[7] = 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
-# .ci/run and the presets of CMake build these.
+# .ci/run and the presets of CMake create these build folders.
 BUILDS = [path for name in ("ci/cpp", "dev", "cpu") if (path := ROOT / "build" / name).is_dir()]
 
 
@@ -27,14 +27,15 @@ def test_core_draws_a_scene_without_python(tmp_path):
     pixels = np.frombuffer(picture.read_bytes()[-320 * 240 * 3 :], np.uint8).reshape(240, 320, 3)
     background = np.array([26, 26, 38])
     shown = (pixels != background).any(axis=2)
-    # There is a ball on either side; the right one is smaller.
+    # The picture shows two balls; the right one is smaller.
     left = shown[:, :160].sum()
     right = shown[:, 160:].sum()
     assert 0.1 < right / shown.size < left / shown.size < 0.4
 
 
 def test_the_library_is_configured_without_what_it_is_measured_with(tmp_path):
-    """A package of a system has neither benchmarks/ nor examples/."""
+    """Source packages of Linux distributions contain neither benchmarks/ nor
+    examples/."""
     pybind11 = pytest.importorskip("pybind11")
     if shutil.which("cmake") is None or shutil.which("ninja") is None:
         pytest.skip("needs cmake and ninja")

@@ -170,7 +170,7 @@ def test_masks_of_modes_are_the_same_without_proc():
 
 
 def test_a_build_needs_no_proc(tmp_path):
-    """A folder without access is mounted over it, in a separate mount namespace."""
+    """A folder without access is mounted over /proc, in a separate mount namespace."""
     v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 500, 0))
     alone = ["unshare", "--mount", "--map-root-user"]
     if subprocess.run([*alone, "true"], capture_output=True, check=False).returncode != 0:

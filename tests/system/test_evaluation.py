@@ -1,4 +1,4 @@
-"""The evaluation: its baselines, its measures, a small run, and the page of its
+"""The evaluation: its baselines, its measures, a small run, and the web page of its
 results."""
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def test_cut_of_the_hierarchy_has_one_node_above_every_leaf(asset, scene, target
         above += chosen[:, at]
         if (at == 0).all():
             break
-        # The root counts once, however long the path to it is.
+        # The root counts only once, although many paths end at it.
         above[:, at == 0] -= chosen[:, [0]]
         at = hierarchy.parent[at]
     assert (above == 1).all()
@@ -102,7 +102,7 @@ def test_hierarchy_at_size_zero_draws_the_asset(asset, scene):
 def test_hierarchy_keeps_moments_and_shares_axes(asset):
     hierarchy = build_hierarchy(asset)
     nodes, parent = hierarchy.gaussians, hierarchy.parent
-    first = len(parent) // 3  # somewhere inside
+    first = len(parent) // 3  # the cut changes at a node in the middle
     siblings = np.flatnonzero(parent == parent[first])
     assert len(siblings) == hierarchy.num_siblings[first] == 2
     low, high = nodes.means[siblings].min(axis=0), nodes.means[siblings].max(axis=0)
@@ -110,8 +110,8 @@ def test_hierarchy_keeps_moments_and_shares_axes(asset):
     assert ((mean >= low - 1e-6) & (mean <= high + 1e-6)).all()
     np.testing.assert_array_less(hierarchy.box[parent, 0], hierarchy.box[:, 0] + 1e-6)
     np.testing.assert_array_less(hierarchy.box[:, 1], hierarchy.box[parent, 1] + 1e-6)
-    # The axes are named alike, so no rotation exceeds 63 degrees, the largest distance
-    # from all 24 rotations that map axes to axes.
+    # The order of the axes is chosen so that rotations are small: none exceeds 63
+    # degrees, the largest distance from all 24 rotations that map axes to axes.
     turn = np.abs((nodes.quats * nodes.quats[parent]).sum(axis=1)) / np.linalg.norm(
         nodes.quats[parent], axis=1
     )
@@ -200,7 +200,7 @@ def test_worst_tile_is_what_its_error_changes_by():
     assert row["tile_median"] == pytest.approx(0.5, abs=1e-3)
     assert row["rms"] == pytest.approx((8 + 1) / 4 * math.sqrt(8 / 40 * 16 / 36), abs=1e-3)
     moving = steadiness.Steadiness()
-    for picture in frames_of(0, 0, 8, 8, 7):  # as in the reference
+    for picture in frames_of(0, 0, 8, 8, 7):  # the reference has the same motion
         moving.add(picture, picture - np.float32(0.125))
     assert moving.row()["tile_worst"] < 1e-3
     assert moving.row()["psnr"] == pytest.approx(-20 * math.log10(0.125), abs=1e-3)
@@ -379,7 +379,7 @@ def test_unknown_part_is_refused(capsys, tmp_path):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """All parts, as small as possible."""
+    """The results of all parts of the evaluation, which are as small as possible."""
     folder = tmp_path_factory.mktemp("evaluation")
     made = evaluation.Evaluation(TINY, "cpu", folder)
     return folder, evaluation.run(made, "tiny", evaluation.NAMES, quiet=True)
@@ -421,7 +421,7 @@ def test_what_is_written_by_hand_stays_behind_a_new_page(tmp_path, monkeypatch):
     output = tmp_path / "results.md"
     output.write_text(f"# Results\n\nold\n\n{report.BY_HAND}\n\n## By hand\n", encoding="utf-8")
     options = report.Report((tmp_path,), output, tmp_path / "tables.md", no_plots=True)
-    for _ in range(2):  # repeated
+    for _ in range(2):  # the second run gives the same results
         report.run(options)
         text = output.read_text(encoding="utf-8")
         assert text == f"# Results\n\nnew\n\n{report.BY_HAND}\n\n## By hand\n"

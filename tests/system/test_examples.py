@@ -1,4 +1,7 @@
-"""The examples run with small sizes. What they need beyond the package is optional."""
+"""Runs the examples with small sizes.
+
+Modules that they need in addition are optional.
+"""
 
 import importlib.util
 import sys
@@ -21,7 +24,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def load_example(name):
     specification = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     module = importlib.util.module_from_spec(specification)
-    sys.modules[name] = module  # dataclasses look for it there
+    sys.modules[name] = module  # dataclasses look up the module there
     specification.loader.exec_module(module)
     return module
 
@@ -64,7 +67,7 @@ def test_what_is_trained_looks_like_the_donut(tmp_path, device):
 
 @pytest.fixture(params=["model of COLMAP", "transforms.json"])
 def capture(tmp_path, request):
-    """Pictures of a donut from around, as photographs with their cameras."""
+    """A capture: pictures of a donut from all sides, with their cameras."""
     cameras = v3dg.turntable((0, 0, 0), 3.5, 10, elevation=0.6, width=64, height=48)
     named = {f"{number}.png": camera for number, camera in enumerate(cameras)}
     (tmp_path / "images").mkdir()
@@ -93,7 +96,7 @@ def test_what_is_trained_looks_like_photographs_that_were_held_out(capture, devi
     path = capture / "trained.ply"
     few = {"start": 500, "sh_degree": 1, "device": device}
     before = example.main(example.Config(capture, path, steps=0, **few))
-    # In their original size, and smaller.
+    # The pictures are used in their original size, and smaller.
     assert example.main(example.Config(capture, path, steps=40, **few)) > before + 3
     assert example.main(example.Config(capture, path, steps=40, longest=32, **few)) > before + 3
     num_points = 200 if (capture / "sparse").is_dir() else 500
@@ -175,8 +178,8 @@ def gsplat_example(tmp_path):
 
 
 def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
-    """The arguments are everything that a rasterizer needs: ours, which interprets them
-    like gsplat, draws the picture."""
+    """The arguments are complete: our rasterizer, which interprets them like gsplat,
+    draws the same picture."""
     example, config = gsplat_example
     scene, camera = example.make_scene(config)
     camera = v3dg.Camera(camera.viewmat, camera.K, camera.width, camera.height, near=0.02)
@@ -206,8 +209,8 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
     options = {"tolerance": config.tolerance, "min_transmittance": 0, "device": "cpu"}
     wanted = v3dg.render(scene, camera, **options)
     assert wanted.alpha.max() > 0.9
-    # Coarser levels have the filter of the arguments; the rest is rounding of the
-    # translation. Where pixels of gsplat stop, ours continue here.
+    # Coarser levels use the filter of the arguments. Other differences are rounding of
+    # the translation, and pixels where gsplat stops blending while ours continues.
     go_on = wanted.alpha < 0.9999
     assert 0.5 < go_on.mean() < 1
     assert psnr(wanted.color[go_on][None], drawn.color.numpy()[go_on][None]) > 100

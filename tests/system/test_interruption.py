@@ -1,5 +1,5 @@
-"""Ctrl-C at difficult moments, and two builds to one place; fuzz/attack.py tries all
-other moments."""
+"""Ctrl-C at difficult moments, and two builds with the same output. fuzz/attack.py
+tries all other moments."""
 
 import os
 import signal

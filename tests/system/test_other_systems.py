@@ -1,5 +1,6 @@
-"""The parts of the core that differ between systems compile for Windows and macOS. On
-this system, the output of the same program does not depend on the number of threads."""
+"""The parts of the core that depend on the operating system compile for Windows and
+macOS. On this system, a program compiled from them prints the same with any number of
+threads."""
 
 import importlib.util
 import os
@@ -12,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 CSRC = ROOT / "csrc"
 BUILDS = [path for name in ("ci/cpp", "dev", "cpu") if (path := ROOT / "build" / name).is_dir()]
-# The seams: what any other source of the core uses of its system goes through these.
+# The only sources of the core that may use functions of the operating system directly.
 SEAMS = (
     "base/isa.cpp",
     "base/process.cpp",

@@ -1,5 +1,5 @@
-"""Pools: pictures of scenes that are only partly in memory, settled or not, and with
-faults."""
+"""Pools: pictures of scenes of which only a part is in memory, both settled and while
+pages arrive, and with faulty files."""
 
 import itertools
 import os
@@ -45,8 +45,11 @@ def path(asset, tmp_path):
 
 @pytest.fixture(params=["mixed", "coded"])
 def scene(request, asset, path):
-    """Return instances of files, each with another SH degree, as codes; or also as
-    rows, with a bundle in memory."""
+    """Return a scene of instances of files with different SH degrees.
+
+    If the parameter is "coded", all files store codes. Otherwise, they store rows, and
+    a bundle in memory is added.
+    """
     rng, scene = np.random.default_rng(1), Scene()
     is_coded = request.param == "coded"
     many = coded(asset, path.with_name("many.v3dg")) if is_coded else Bundle.open(path)
@@ -66,8 +69,8 @@ def coded(bundle, path):
 
 
 def scaled(scene, memory):
-    """Return the bytes for a scene of codes that hold about as many gaussians as these
-    bytes for a scene of rows."""
+    """Return the size of a pool that holds about as many gaussians of this scene as a
+    pool of the size `memory` holds rows."""
     return (
         memory if any(bundle.codec == "float32" for bundle in scene.bundles) else int(0.3 * memory)
     )
@@ -105,7 +108,7 @@ def test_settled_picture_is_that_of_all_pages(scene, device, options):
 
 @pytest.mark.parametrize("memory", ["64MB", 500_000])
 def test_stills_are_settled(scene, device, memory):
-    """This also holds if they are awaited when pages of other views are resident."""
+    """This also holds if pages of other views are resident at the beginning."""
     cameras = [CAMERA, NEAR, AWAY]
     if memory != "64MB":
         memory = scaled(scene, memory)
@@ -145,7 +148,7 @@ def status_after(renderer, camera, **options):
 
 
 def memory_for(scene, device, num_slots):
-    """Return the bytes of a pool with this number of slots."""
+    """Return the size in bytes of a pool with this number of slots."""
     low, high = 1 << 10, 1 << 26
     while high - low > 64:
         middle = (low + high) // 2
@@ -210,10 +213,8 @@ def test_frames_become_finer_until_nothing_is_missing(scene, device):
 
 @pytest.mark.parametrize(("memory", "most"), [("64MB", 1), ("8MB", 3), ("4MB", 5)])
 def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, most):
-    """The number is the number of bytes that are needed, divided by the eighth of the
-    pool that is loaded at once, plus one. Pages of all 13 levels are requested at once.
-
-    Pages of all levels are asked for at once: there are 13 of them.
+    """The limit is the ratio of the bytes that are needed to the eighth of the pool
+    that is loaded at once, plus one. Pages of all 13 levels are requested at once.
     """
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     rng = np.random.default_rng(0)
@@ -235,7 +236,7 @@ def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, m
 def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
     renderer = Renderer(scene, device=device, memory=scaled(scene, 150_000))
     tolerances = [FINE["tolerance"]]
-    # A quick frame comes before the next decision.
+    # Frames are faster than decisions about the tolerance, so many are needed.
     while tolerances[-1] <= 1 and len(tolerances) < 20_000:
         tolerances.append(renderer.render(CAMERA, **FINE).stats.tolerance)
     steps = np.array(tolerances[1:]) / tolerances[:-1]
@@ -246,7 +247,8 @@ def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_pages_are_there_together_with_those_above_them(scene, device, seed, monkeypatch):
-    """Frames and reads are in every order, with too little room for most views."""
+    """Frames and reads alternate in random order, and the pool is too small for most
+    views."""
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     rng = np.random.default_rng(seed)
     renderer = Renderer(
@@ -271,7 +273,7 @@ def test_pages_are_there_together_with_those_above_them(scene, device, seed, mon
             (a & ~b).any() for a, b in zip(before, there, strict=True)
         )
         before = there
-    assert num_changes > 0  # pages were also evicted
+    assert num_changes > 0  # otherwise no page was evicted
 
 
 def order_of_reading(scene, monkeypatch):
@@ -295,13 +297,12 @@ def order_of_reading(scene, monkeypatch):
 
 
 def test_no_page_is_read_before_those_above_it(scene, monkeypatch):
-    """Each page can be drawn from the next picture on."""
+    """A page that has been read can be drawn in the next picture."""
     assert len(order_of_reading(scene, monkeypatch)) > 100
 
 
 def test_neighbours_in_a_file_are_read_one_after_another(path, monkeypatch):
-    """Each level is at most as long as a read of 512 KiB, except for the finest level,
-    which is longer."""
+    """Each level fits in one read of 512 KiB, except for the finest level."""
     bundle = Bundle.open(path)
     scene = Scene()
     scene.add(bundle)
@@ -331,8 +332,8 @@ def film_of_arriving_pages(scene, device, options, num_frames=150):
 
 
 def worst_tile(pictures):
-    """Return the root mean square, in 255ths, of the tile that changes most between two
-    pictures."""
+    """Return the root mean square of the difference of two pictures, in 255ths, of the
+    tile where it is largest."""
     changes = (np.square(255.0 * (b - a)).mean(-1) for a, b in itertools.pairwise(pictures))
     return max(np.sqrt(tile_means(change).max()) for change in changes)
 
@@ -364,7 +365,7 @@ def test_settling_ends_what_fades_in(scene, device):
 
 
 def test_what_is_read_since_settling_does_not_fade_in(scene, device):
-    """It is complete in the next picture."""
+    """Pages that are read during `settle` are complete in the next picture."""
     renderer = Renderer(scene, device=device, memory="64MB")
     pool = renderer.pool_frame.core
     options = {"budget": None, "min_level": 0, "fade": 1.05, **FINE}
@@ -384,10 +385,9 @@ def test_without_a_fade_pages_are_there_at_once(scene, device, monkeypatch):
 
 
 def test_pages_that_come_again_fade_in_again(device, monkeypatch):
-    """The room is enough for one view, but not for two, and frames without a fade are
+    """The pool has room for one view, but not for two. Frames without a fade are drawn
     in between. No page of the last picture is evicted.
 
-    None leaves that the picture before showed.
     """
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     rng, scene = np.random.default_rng(0), Scene()
@@ -475,7 +475,7 @@ def damage(path, page):
 
 
 def draws_coarser(renderer):
-    """Return the pictures until pages failed; they are drawn with coarser pages."""
+    """Return the pictures until pages failed. After that, coarser pages are drawn."""
     deadline = time.monotonic() + 30
     while (image := renderer.render(CAMERA, tolerance=0.0)).stats.failed == 0:
         assert time.monotonic() < deadline
@@ -492,7 +492,7 @@ def test_damaged_page_leaves_the_picture_coarser_and_is_named(path, device):
     draws_coarser(renderer)
     with pytest.raises(ValueError, match=r"asset\.v3dg: page 3: the hash does not match"):
         renderer.settle(CAMERA, tolerance=0.0)
-    # All pages except that one are resident.
+    # All pages except the damaged one are resident.
     assert host(renderer.render(CAMERA, tolerance=0.0).alpha).max() > 0.1
     damage(path, 3)  # the camera returns
     renderer.settle(CAMERA, tolerance=0.0)
@@ -500,7 +500,7 @@ def test_damaged_page_leaves_the_picture_coarser_and_is_named(path, device):
 
 
 def test_of_pages_that_are_read_together_only_the_damaged_ones_fail(path, device):
-    damaged = [3, 4, 40]  # it is of the finest level, so no page is below it
+    damaged = [3, 4, 40]  # page 3 belongs to the finest level, so no page is below it
     for page in damaged:
         damage(path, page)
     renderer = Renderer(Bundle.open(path), device=device, memory="64MB")
@@ -575,10 +575,10 @@ def test_disk_that_does_not_answer_ends_the_wait(path, device, monkeypatch):
         renderer.settle(CAMERA, timeout=0.2, **FINE)
     assert time.monotonic() - start < 20
     for _ in range(3):
-        image = renderer.render(CAMERA, **FINE)  # does not wait
+        image = renderer.render(CAMERA, **FINE)  # `render` does not wait for pages
     assert image.stats.missing > 0
     core = renderer.pool_frame.core
-    while core.read_one():  # page by page, the most urgent first
+    while core.read_one():  # read page by page, beginning with the most urgent
         before = image.stats.missing
         image = renderer.render(CAMERA, **FINE)
         assert image.stats.missing <= before
@@ -588,7 +588,9 @@ def test_disk_that_does_not_answer_ends_the_wait(path, device, monkeypatch):
 
 def test_child_of_a_fork_is_told_to_make_another(path):
     renderer = Renderer(Bundle.open(path), device="cpu", memory="64MB")
-    for k in range(20):  # while threads read, any of whose locks may be held during a fork
+    # fork while threads are reading, because a lock of theirs may be held at that
+    # moment
+    for k in range(20):
         renderer.render([CAMERA, NEAR][k % 2], **FINE)
         child = os.fork()
         if child == 0:
@@ -602,8 +604,8 @@ def test_child_of_a_fork_is_told_to_make_another(path):
 
 @pytest.mark.parametrize("num_threads", [2, 4])
 def test_stills_of_threads_are_settled(path, num_threads):
-    """They share a pool with room for about one view. No thread draws from the pages of
-    another thread's view."""
+    """The threads share a pool with room for about one view. No thread draws with the
+    pages that were loaded for another."""
     scene = Scene()
     scene.add(Bundle.open(path), positions=[[-1.0, 0, 0], [1, 0, 0]])
     cameras = [CAMERA, NEAR, AWAY] * 8
@@ -624,8 +626,8 @@ def test_stills_of_threads_are_settled(path, num_threads):
 
 
 def test_only_the_last_pool_of_stills_is_kept(path):
-    """A pool has threads and memory, which would accumulate for a bundle that is drawn
-    with many sizes."""
+    """A pool has threads and memory. If pools were kept, they would accumulate while a
+    bundle is drawn with many sizes."""
     bundle = Bundle.open(path)
     render(bundle, CAMERA, device="cpu", memory="64MB", **FINE)
     before = len(os.listdir("/proc/self/task"))
@@ -644,7 +646,8 @@ def test_stills_of_one_size_share_a_pool_whatever_its_text(path):
 
 
 def test_children_of_a_fork_draw_stills(path):
-    """They have their own pool, even if threads of the parent use the other one."""
+    """A child process has its own pool, even if threads of the parent use the other
+    one."""
     bundle = Bundle.open(path)
     expected = arrays(render(bundle, NEAR, device="cpu", memory="64MB", **FINE))
     is_over = threading.Event()
@@ -672,8 +675,8 @@ def test_children_of_a_fork_draw_stills(path):
 
 
 def test_picking_from_a_pool_of_another_process_is_refused(path):
-    """This also holds while another thread of the parent draws; the child does not wait
-    for its lock."""
+    """This also holds while another thread of the parent draws. The child does not wait
+    for the lock of that thread."""
     bundle = Bundle.open(path)
     renderer = Renderer(bundle, device="cpu", memory="64MB")
     renderer.settle(CAMERA, **FINE)
@@ -702,7 +705,8 @@ def test_picking_from_a_pool_of_another_process_is_refused(path):
 
 
 def exit_code(child):
-    """Return the exit code of a child that ends within a minute; -9 if it does not."""
+    """Return the exit code of a child process, or -9 if it does not end within a
+    minute."""
     end = time.monotonic() + 60
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -725,8 +729,8 @@ def test_devices_need_the_same_pages(scene):
 
 @pytest.mark.gpu
 def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
-    """Many pictures of views with different pages are in flight, and none of them is
-    looked at."""
+    """Many pictures of views with different pages are in flight, and no result is read
+    until the end."""
     renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
     rng = np.random.default_rng(5)
     cameras = [
@@ -745,7 +749,7 @@ def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
 
 @pytest.mark.gpu
 def test_pages_that_leave_before_a_frame_has_them_are_not_drawn(scene):
-    """Several pictures are awaited, with none in between that applies the changes."""
+    """The pool loads pages for several pictures before a frame applies the changes."""
     renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
     rng = np.random.default_rng(7)
     for _ in range(20):

@@ -1,4 +1,4 @@
-"""Pools whose size is chosen from the free memory of the device, and only if not
+"""Pools whose size depends on the free memory of the device. No pool is used if
 everything fits there."""
 
 import numpy as np
@@ -46,8 +46,8 @@ def assert_same(image, expected):
 
 
 def size_of(path, device):
-    """Return the size of a whole bundle on the device and, if that is another, on the
-    host."""
+    """Return the size of a whole bundle on the device and, if the device is not the
+    host, on the host."""
     return residency.bytes_to_add([Bundle.open(path)], _device.resolve(device))
 
 
@@ -76,7 +76,7 @@ def test_all_is_resident_where_it_fits(path, device):
 
 def test_what_does_not_fit_gets_a_pool_and_says_so(path, device, free):
     needed = max(size_of(path, device).values())
-    free(needed)  # a quarter of it is kept free
+    free(needed)  # a quarter of this is kept free, so there is too little
     bundle = Bundle.open(path)
     renderer = Renderer(bundle, device=device)
     assert renderer.memory == needed // 2
@@ -123,7 +123,8 @@ def test_the_rule_is_what_is_free_less_a_quarter_of_it_or_a_gib(path, device, fr
 @pytest.mark.gpu
 def test_the_host_has_to_hold_what_a_gpu_draws_whole(path, free):
     bundle = Bundle.open(path)
-    free(bundle.page_bytes, CPU)  # a quarter of it is kept free
+    # a quarter of this is kept free, so there is too little
+    free(bundle.page_bytes, CPU)
     assert Renderer(bundle, device="cuda").memory is not None
 
 
@@ -223,7 +224,7 @@ def test_residency_tells_what_waits_for_pages_from_what_is_wanted(scene, monkeyp
     assert share_missing(first).mean() > 0.99  # the coarsest pages everywhere
     far = Camera.look_at((0, -60, 1), (0, 0, 0), (0, 0, 1), 0.13, width=93, height=61)
     coarse = renderer.render(far, tolerance=1e9)
-    assert share_missing(coarse).mean() == 0  # this is wanted here
+    assert share_missing(coarse).mean() == 0  # the coarsest pages suffice here
     shares = [share_missing(first).mean()]
     pool = renderer.pool_frame.core
     while renderer.render(CAMERA, **options).stats.missing:

@@ -52,6 +52,6 @@ def test_a_flight_holds_no_more_than_the_pool_and_tables(tmp_path):
         bundle.write(path)
     all_of_it = COPIES * bundle.page_bytes
     assert all_of_it > 5 * POOL
-    frames = 12 * MIB  # pictures, cuts, and memory that the allocator keeps
+    frames = 12 * MIB  # room for pictures, cuts, and memory that the allocator keeps
     assert held("none", paths) > all_of_it
     assert held(POOL, paths) < POOL + frames

@@ -1,5 +1,5 @@
-"""Refinements in units: what they leave unchanged, that they depend neither on workers
-nor on interruptions, and how units are made."""
+"""Refinements in units: what they leave unchanged, and how units are made. The result
+depends neither on workers nor on interruptions."""
 
 import os
 import signal
@@ -166,7 +166,7 @@ def test_level_0_and_the_tables_stay(draft, refined):
 def test_all_other_levels_move(draft):
     request = replace(REQUEST, steps=100, drop=0)
     refined = refined_bundle(draft, request, [CPU], progress=False)
-    # The last level has one gaussian, which is in few cuts.
+    # The last level has one gaussian, which few cuts contain, so it is left out.
     for level in range(1, draft.num_levels - 1):
         means, moved = (bundle.level_gaussians(level).means for bundle in (draft, refined))
         assert means.shape == moved.shape
@@ -174,8 +174,8 @@ def test_all_other_levels_move(draft):
 
 
 def test_the_part_above_leaves_the_levels_of_units_alone(draft):
-    """It is compared with the first of its levels, drawn with the filter of that level,
-    and moves only the levels that no unit has."""
+    """The part above the units is compared with the first of its own levels, drawn with
+    the filter of that level. It moves only levels that no unit has."""
     division = divided(draft, UNIT_LEAVES)
     upper = division.upper.of(draft)
     first = division.top - division.upper.first_level
@@ -308,7 +308,7 @@ def test_the_bar_counts_all_units(draft, tmp_path):
     def note(*state):
         states.append(state)
 
-    for _ in range(2):  # the second time, all units are there
+    for _ in range(2):  # the second time, all units are finished
         states.clear()
         refined_bundle(opened, REQUEST, [CPU], note, folder)
         assert {state[1] for state in states} == {total}
@@ -361,7 +361,7 @@ build_file(
 
 
 def test_a_refinement_that_is_killed_again_and_again_gets_to_its_end(file, tmp_path):
-    """The bytes are those of a refinement in one go."""
+    """The result has the same bytes as that of an uninterrupted refinement."""
     output = tmp_path / "out" / "out.v3dg"
     output.parent.mkdir()
     folder = units_folder(levels_path(output))
@@ -373,8 +373,8 @@ def test_a_refinement_that_is_killed_again_and_again_gets_to_its_end(file, tmp_p
         process = subprocess.Popen(arguments, env=environment)
         while process.poll() is None:
             names = {path.name for path in folder.glob("*.v3dg")}
-            # The process may already write the result, which a kill would interrupt, if
-            # the levels above the units are finished.
+            # If the levels above the units are finished, the process may already write
+            # the result, and a kill would interrupt this.
             if num_kills < len(names) <= NUM_UNITS:
                 process.send_signal(signal.SIGKILL)
                 assert finished < names
@@ -430,8 +430,8 @@ def test_a_second_refinement_with_the_same_output_is_refused(draft, file, tmp_pa
 
 
 def test_a_lock_on_a_folder_that_was_removed_is_none(tmp_path, monkeypatch):
-    """If a refinement ends and removes the folder that another one has opened, the lock
-    of the latter would protect nothing."""
+    """If a refinement ends and removes the folder that another refinement has opened, a
+    lock on this folder would no longer protect anything."""
     folder = tmp_path / "out.units"
     locked = []
 

@@ -1,5 +1,5 @@
-"""Several threads, forked processes, and torch in the same process: the same results,
-and no deadlock."""
+"""Threads, forked processes, and torch in the same process give the same results,
+without deadlocks."""
 
 import copy
 import hashlib
@@ -22,7 +22,7 @@ from command_line import TESTS_ENVIRONMENT
 from devices import host
 
 CAMERA = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
-SECONDS = 120  # longer than any of these takes on a busy machine
+SECONDS = 120  # more time than any of these programs needs on a busy machine
 
 
 def digest(*arrays):
@@ -62,7 +62,7 @@ def frame(scene, device="cpu"):
 
 
 def frame_and_cut(scene, device):
-    """Draw a frame and select a cut, which both use the resident data of a scene."""
+    """Draw a frame and select a cut. Both use the resident data of a scene."""
     cut = v3dg.select(scene, CAMERA, tolerance=2.0, device=device)
     return frame(scene, device), digest(cut.instance_ids, cut.cluster_ids)
 
@@ -87,7 +87,7 @@ def bundle_of(gaussians, device="cpu"):
         (
             bundle_of,
             [asset(seed, 100 + 200 * seed) for seed in range(3)],
-        ),  # of groups of several sizes
+        ),  # with groups of several sizes
     ],
     ids=["rasterize", "backward", "render", "build"],
 )
@@ -131,7 +131,10 @@ def test_streams_of_several_threads_get_what_one_gets_alone():
 
 
 def test_threads_may_share_a_renderer_of_an_asset(device, hasty):
-    """Pictures have many sizes, whose memory is allocated while other threads draw."""
+    """The pictures have many sizes.
+
+    Memory for them is allocated while other threads draw.
+    """
     subject = asset() if device == "cpu" else asset().torch(device)
     cameras = [CAMERA.scaled(1 + k % 4) for k in range(8)]
 
@@ -200,8 +203,8 @@ def test_frames_of_a_scene_that_moves_are_old_or_new(device, hasty):
 
 
 def test_frames_of_a_scene_that_grows_and_shrinks_are_old_or_new(device, hasty):
-    """A bundle is added meanwhile, too. A cut of removed instances is refused, or drawn
-    as it was."""
+    """Meanwhile, a bundle is also added. A cut of removed instances is refused, or
+    drawn as it was."""
     scene, other = crowd(6), crowd(7).bundles[0]
     cut = v3dg.select(scene, CAMERA, tolerance=2.0, device=device)
 
@@ -354,7 +357,7 @@ def test_one_thread_gives_the_same(expected, threads):
 
 
 def test_forked_process_gives_the_same(expected):
-    """This also holds for a child of a child, and for the parent afterwards."""
+    """The same holds for a child of a child, and for the parent afterwards."""
     script = """
 import os
 def in_child(work):
@@ -374,7 +377,8 @@ show()
 
 
 def test_processes_may_be_forked_while_threads_draw(expected):
-    """Data loaders do this: multiprocessing forks a process whose threads work."""
+    """Data loaders use multiprocessing, which forks a process whose threads are at
+    work."""
     script = """
 import multiprocessing, threading
 stop = threading.Event()
@@ -417,8 +421,8 @@ for t in threads: t.join()
     "libasan" in Path("/proc/self/maps").read_text(), reason="the address checks need all addresses"
 )
 def test_memory_that_runs_out_is_an_error_and_nothing_else():
-    """This holds at any moment: the process continues, and once there is memory again,
-    the results are the same."""
+    """Memory may run out at any moment. The process continues, and gives the same
+    results once there is memory again."""
     script = """
 import resource
 from collections import Counter
@@ -441,7 +445,7 @@ for work, subject in zip((picture, gradient, frame, bundle_of), subjects):
     print(work.__name__, seen["MemoryError"] > 0, work(subject) == expected)
 """
     pytest.importorskip("torch")
-    # There is one arena that returns freed memory at once, so that the limit takes
+    # With a single arena that returns freed memory at once, the memory limit takes
     # effect soon.
     allocator = {
         "MALLOC_ARENA_MAX": "1",
@@ -454,8 +458,8 @@ for work, subject in zip((picture, gradient, frame, bundle_of), subjects):
 
 
 def test_thread_that_ends_before_its_first_line_is_an_error(monkeypatch):
-    """Threads end like this if there is no memory to begin; threading.Thread would wait
-    for ever."""
+    """A thread ends before its first line if there is no memory to begin it.
+    threading.Thread would then wait for ever."""
     starts_nothing = SimpleNamespace(start_new_thread=lambda work, arguments: 0)
     monkeypatch.setattr(sys.modules["v3dg.levels.fit"], "_thread", starts_nothing)
     with pytest.raises(MemoryError, match="ended at once"):

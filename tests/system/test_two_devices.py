@@ -1,5 +1,5 @@
-"""Two CUDA devices in one process: work is done where its arrays are, whichever device
-is current."""
+"""Two CUDA devices in one process. Work is done on the device of its arrays, whichever
+device is current."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
-"""A page crops the shown asset by a box: which file this gives, and where cropping is
-refused."""
+"""The web page of the viewer crops the shown asset by a box: which file this writes,
+and where cropping is refused."""
 
 import time
 from urllib.parse import urlsplit

@@ -1,4 +1,4 @@
-"""Who may use the viewer, and what their messages can cause."""
+"""Which addresses may use the viewer, and what effects messages can have."""
 
 import copy
 import http.client
@@ -36,7 +36,7 @@ SECONDS = 60
 
 @pytest.fixture
 def opened(blob_view):
-    """Open sites that are closed after the test."""
+    """Return a function that opens sites. They are closed after the test."""
     sites = []
 
     def open_site(**options):
@@ -49,7 +49,7 @@ def opened(blob_view):
 
 
 def status(site, path="/", **headers):
-    """Return the status of the answer to a request for a page."""
+    """Return the HTTP status of the response to a request for the web page."""
     connection = http.client.HTTPConnection("127.0.0.1", site.port, timeout=SECONDS)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
@@ -59,7 +59,7 @@ def status(site, path="/", **headers):
 
 
 def connects(site, path="/", **headers):
-    """Return whether a page with these headers can use the site."""
+    """Return whether a web page with these headers may connect to the site."""
     try:
         viewer_client.Tab(site.port, path, additional_headers=headers).__exit__()
     except websockets.exceptions.InvalidStatus as refusal:
@@ -125,8 +125,8 @@ def test_other_pages_cannot_use_the_viewer(opened, origin):
     ],
 )
 def test_names_that_others_lead_here_are_refused(opened, host):
-    """A page under a name that was made to resolve to this machine has an Origin that
-    equals its Host."""
+    """If a foreign host name resolves to this machine, the Origin of a web page under
+    that name equals its Host."""
     site = opened()
     host = host.format(port=site.port)
     assert status(site, Host=host.encode()) == 403
@@ -139,7 +139,8 @@ def test_names_that_others_lead_here_are_refused(opened, host):
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "127.8.7.6", "[::1]"])
 def test_this_machine_may_use_the_viewer_by_any_of_its_names(opened, name):
-    """This also holds for another port, from which a connection may be forwarded."""
+    """All of its names are accepted with other ports, too, because a port may be
+    forwarded."""
     site = opened()
     for host in (f"{name}:{site.port}", f"{name}:9999", name):
         assert site._gate.refusal(request(Host=host, Origin=f"http://{host}")) is None
@@ -159,8 +160,8 @@ TAB = {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
     "relation", ["cross-site", "same-site", "", "Same-Origin", "none, cross-site"]
 )
 def test_pages_of_other_sites_are_shown_nothing(opened, relation):
-    """The browser says how they are related to the viewer, also for requests of
-    pictures, which have no Origin."""
+    """The browser sends how other sites are related to the viewer, even with requests
+    for pictures, which have no Origin."""
     site = opened()
     for path in ("/", "/main.js", "/photograph/0", "/connection"):
         for destination in ("image", "script", "style", "iframe", "object", "empty"):
@@ -282,7 +283,7 @@ def test_photographs_of_cameras_are_handed_out_small(opened, tmp_path):
 
 
 def test_a_photograph_that_cannot_be_decoded_is_not_there(opened, tmp_path, monkeypatch):
-    """For damaged files, Pillow also raises SyntaxError and struct.error."""
+    """Pillow may also raise SyntaxError and struct.error for damaged files."""
 
     def fail(*_):
         raise SyntaxError("not a TIFF file")
@@ -376,7 +377,7 @@ def test_bundles_go_by_their_names(blob_bundle, tmp_path):
     assert SceneView(scene, device="cpu").explain(error) == "[Errno 5] cannot be read: 'a.v3dg'"
 
 
-# Hostile messages.
+# Malicious messages.
 
 NASTY = [
     None, True, False, 0, -1, 1, 3.14, 1e-300, 1e300, -1e308,
@@ -407,7 +408,7 @@ def mutated(rng, message):
 
 
 def hostile(rng, messages, kinds):
-    """Return something that no browser sends."""
+    """Return a random message that no browser sends."""
     choice, message = rng.random(), mutated(rng, rng.choice(messages))
     if choice < 0.7:
         return message
@@ -424,8 +425,8 @@ def hostile(rng, messages, kinds):
 
 
 def test_no_message_ends_the_viewer(opened, blob_view, capfd):
-    """Thousands of wrong messages with valid ones in between are sent while the viewer
-    draws. It ignores the wrong ones and continues."""
+    """Thousands of wrong messages, with valid ones in between, are sent while the
+    viewer draws. The viewer ignores the wrong ones and continues."""
     aside = v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)
     site, rng = opened(cameras={"aside": aside}), random.Random(7)
     kinds = [kind.__struct_config__.tag for kind in messages.Message.__args__]
@@ -448,7 +449,7 @@ def test_no_message_ends_the_viewer(opened, blob_view, capfd):
                 tab.look(View((1, 0, 0, 0), (1e15, -1e15, 0), 1e-4, 1.0), (1, 1 << 20))
                 tab.pictures(time.perf_counter() + 0.2)
             except websockets.exceptions.ConnectionClosed:
-                pass  # a client like this may expect this
+                pass  # the viewer may close such a connection
     for now, before in zip(blob_view.scene.poses, poses, strict=True):
         assert np.isfinite(now).all()
         assert now.shape == before.shape

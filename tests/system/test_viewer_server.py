@@ -1,5 +1,5 @@
-"""The viewer's server and its command: the address, the first messages to a tab, and
-how they end."""
+"""The viewer's server and its command: the address, the first messages to a browser
+tab, and how both end."""
 
 import contextlib
 import os
@@ -24,8 +24,8 @@ from v3dg.viewer.server import Site, start_view
 websockets = pytest.importorskip("websockets")
 
 pytestmark = [
-    # If a site closes while a client is connecting, its end of the connection is left
-    # to the garbage collector.
+    # If a site closes while a client is connecting, only the garbage collector closes
+    # the site's end of the connection.
     pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
     pytest.mark.usefixtures("collected_connections"),
 ]
@@ -99,13 +99,13 @@ def test_tab_begins_with_all_of_the_scene_in_view(blob_view, up):
     above = np.dot(np.array(view.position) - blob_view.framing.center, up)
     assert above > 0.3 * blob_view.framing.radius
     camera = view.camera(160, 90, blob_view.near)
-    assert -camera.viewmat[1, :3] @ up > 0.8  # upright
+    assert -camera.viewmat[1, :3] @ up > 0.8  # the camera is upright
 
 
 @contextlib.contextmanager
 def viewing(bundle, folder, *options):
-    """Yield the command in a separate session once it has printed its address, and the
-    line that it printed."""
+    """Start the command in a separate session. Yield it, and the line with its address,
+    once it has printed that line."""
     bundle.write(folder / "blob.v3dg")
     environment = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
     process = subprocess.Popen(
@@ -128,8 +128,8 @@ def viewing(bundle, folder, *options):
 
 
 def ends(process, *signals):
-    """Return whether the command ends as it should after these signals, each a moment
-    after the one before."""
+    """Return whether the command ends correctly after these signals, which are sent at
+    short intervals."""
     for number in signals:
         process.send_signal(number)
         time.sleep(random.uniform(0.0, 0.05))
@@ -175,7 +175,7 @@ def test_command_opens_a_browser_where_there_is_one(
         end = time.monotonic() + (30 if opens else 1)
         while not (tmp_path / "opened").exists() and time.monotonic() < end:
             time.sleep(0.05)
-        time.sleep(0.1)  # until it is written
+        time.sleep(0.1)  # give the file time to be written
         ends(process, signal.SIGINT)
     assert (tmp_path / "opened").exists() == opens
     if opens:
@@ -207,8 +207,8 @@ JOBS = ("film", "picture", "play", "cameras")
 )
 @pytest.mark.parametrize("turn", range(INTERRUPTS))
 def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_path, signals, turn):
-    """V3DG_INTERRUPTS is the number of rounds; each interrupts at another moment of
-    drawing and of starting jobs."""
+    """The environment variable V3DG_INTERRUPTS sets the number of rounds. Each round
+    interrupts at another moment of drawing and of starting jobs."""
     viewer_client = pytest.importorskip("viewer_client")
     home, end = start_view(blob_view, (0, 0, 1)), time.monotonic() + random.uniform(0.2, 1.0)
     with viewing(blob_bundle, tmp_path) as (process, line):

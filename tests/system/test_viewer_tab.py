@@ -1,5 +1,5 @@
-"""A tab of the viewer, seen from the page's side of its connection, which viewer_client
-plays."""
+"""A browser tab of the viewer, seen from the web page's end of the connection.
+viewer_client plays the page."""
 
 import io
 import json
@@ -42,7 +42,7 @@ def site(blob_bundle, tmp_path_factory):
 
 
 def in_json(settings):
-    """Return settings in the form in which the page receives them."""
+    """Return settings in the form in which the web page receives them."""
     return json.loads(json.dumps(asdict(settings)))
 
 
@@ -55,7 +55,7 @@ def tab(site):
 
 
 def settled(tab):
-    """Return the picture at rest: in full size, and of the last request."""
+    """Return the settled picture: in full size, and for the last request."""
     last, end = None, time.monotonic() + 60
     while time.monotonic() < end:
         pictures = tab.pictures(time.perf_counter() + 0.1)
@@ -79,7 +79,7 @@ def saved(tab, what, name, path=()):
 
 
 def beside(site):
-    """Return the view after a quarter of a turn."""
+    """Return the view rotated by a quarter of a turn."""
     x, y, z = site.home.position
     return look_at((-y, x, z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect)
 
@@ -342,4 +342,4 @@ def test_picture_is_saved_in_full(tab, site):
     with Image.open(io.BytesIO(saved(tab, "picture", "blobs.png"))) as picture:
         pixels = np.asarray(picture).astype(int)
     assert pixels.shape == shown.shape
-    assert abs(pixels - shown).mean() < 3  # except for JPEG
+    assert abs(pixels - shown).mean() < 3  # JPEG causes small differences

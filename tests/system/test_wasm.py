@@ -1,6 +1,6 @@
-"""The core in WebAssembly decides like `v3dg.select`, and decodes pages to the same
-bits, in Node.js and in a worker of Chromium. V3DG_WASM_VIEWS sets the number of
-views."""
+"""The core in WebAssembly chooses the same cuts as `v3dg.select`, and decodes pages to
+the same bits. It runs in Node.js and in a worker of Chromium. V3DG_WASM_VIEWS sets the
+number of views."""
 
 import gzip
 import importlib.util
@@ -55,7 +55,7 @@ def module(tmp_path_factory):
 
 
 class Arrays:
-    """The file with the arrays for Node.js."""
+    """A file that contains arrays for Node.js."""
 
     def __init__(self):
         self._parts = []
@@ -74,7 +74,10 @@ class Arrays:
 
 
 def tables_of(bundle, arrays, *, by_pages):
-    """Return the places of a bundle's tables; with a page table if `by_pages`."""
+    """Write a bundle's tables to the file and return their places.
+
+    With `by_pages`, include a page table.
+    """
     clusters = bundle.clusters
     groups = bundle.groups
     tables = {
@@ -147,7 +150,7 @@ def random_rule(rng):
 
 
 def view_of(camera, rule):
-    """Return a view for core.js."""
+    """Return a camera as a view of core.js."""
     view = {
         **web_pages.pinhole_of(camera),
         "tolerance": None if rule["tolerance"] == np.inf else rule["tolerance"],
@@ -237,7 +240,7 @@ RUN_WORKER = """() => new Promise((resolve) => {
 
 
 def run_chromium(browser, module, folder, arrays, trials):
-    """Do the same as `run_node` in a worker of a page."""
+    """Do the same as `run_node`, in a worker of a web page."""
     arrays.write(folder / "arrays.bin")
     (folder / "trials.json").write_text(json.dumps(trials))
     (folder / "worker.js").write_text(WORKER)
@@ -309,7 +312,7 @@ def test_pages_are_decoded_to_the_same_bits(module, tmp_path, degree):
     codec = codec_of("quantized", degree)
     words = _core.encode_page(gaussians.rows, offset).view(np.uint32)
     damaged = words.copy()
-    damaged[-12:] = 0x7F800000  # infinite ranges
+    damaged[-12:] = 0x7F800000  # makes the ranges infinite
     arrays = Arrays()
     page = {"offset": arrays.add(offset), "bytes": arrays.add(words.view(np.uint8))}
     trials = {

@@ -1,4 +1,7 @@
-"""The pool of the page for browsers stays closed towards the root, in Node.js."""
+"""The pool of the exported web page always keeps the pages above a resident page.
+
+Runs in Node.js.
+"""
 
 import json
 import shutil
@@ -10,7 +13,7 @@ import web_pages
 
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 
-# Trees of 63 pages, of which page 62 is the coarsest: page p is below page 32 + p / 2.
+# Each tree has 63 pages. Page 62 is the coarsest, and page p is below page 32 + p / 2.
 PROGRAM = """
 import { PagePool } from "POOL";
 let state = 1;

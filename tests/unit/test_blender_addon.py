@@ -1,5 +1,5 @@
-"""Tests the parts of the Blender add-on that need no Blender: cameras, cuts, the pace,
-and its archive."""
+"""Tests those parts of the Blender add-on that do not need Blender: cameras, cuts, the
+pace, and its archive."""
 
 import importlib.util
 import zipfile
@@ -39,7 +39,7 @@ def bundle(tmp_path_factory):
 
 
 def perspective(fx, fy, cx, cy, width, height):
-    """Return the projection matrix of OpenGL, near 1 and far 3."""
+    """Return the projection matrix of OpenGL with the depths 1 (near) and 3 (far)."""
     return np.array(
         [
             [2 * fx / width, 0, 1 - 2 * cx / width, 0],
@@ -51,7 +51,7 @@ def perspective(fx, fy, cx, cy, width, height):
 
 
 def clip_pixels(view_from_world, projection, points, width, height):
-    """Return the pixels (N, 2) at which OpenGL draws points, with v down."""
+    """Return the pixels (N, 2) at which OpenGL draws points. v points down."""
     matrix = projection @ view_from_world
     clip = np.column_stack([points, np.ones(len(points))]) @ matrix.T
     device = clip[:, :2] / clip[:, 3:]
@@ -106,7 +106,7 @@ def test_a_viewport_has_a_camera():
 
 
 def crowd(bundle):
-    """Return a scene with a near instance, and far ones of two appearances."""
+    """Return a scene with a near instance, and far ones with two appearances."""
     scene = v3dg.Scene()
     scene.add(bundle, (0, 0, 0), up="z")
     far = np.column_stack([np.arange(6) - 3.0, np.full(6, 900.0), np.zeros(6)])

@@ -36,8 +36,7 @@ def test_look_at_centres_the_target(eye, direction, up):
 
 
 def test_transposed_matrices_are_taken():
-    """The memory of `matrix.T` is in column-major order, whereas the core reads
-    rows."""
+    """The memory of `matrix.T` is in column-major order, but the core reads rows."""
     turned = Camera.look_at((1, 2, 3), (4, 5, 7), width=64, height=48)
     camera = Camera(np.asfortranarray(turned.viewmat), np.asfortranarray(turned.K), 64, 48)
     assert camera.viewmat.flags.c_contiguous
@@ -72,8 +71,8 @@ def test_camera_of_the_core_is_made_once():
 
 
 def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
-    """The rows are orthonormal only up to the precision of float32 text, far from the
-    origin."""
+    """The rows are orthonormal only up to the precision of float32 text, and the camera
+    is far from the origin."""
     exact = Camera.look_at((3e4, -2e4, 5e3), (1, 2, 3), width=64, height=48).viewmat
     viewmat = np.round(exact, 4)
     camera = Camera(viewmat, np.diag([50.0, 50.0, 1.0]), 64, 48)
@@ -83,7 +82,7 @@ def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
 
 def test_look_at_has_up_upwards_and_right_to_the_right():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), (0, 0, 1), math.pi / 2, width=200, height=100)
-    # Y points down, so a higher point is in a smaller row.
+    # y points down, so a higher point is in a row with a smaller index.
     np.testing.assert_allclose(pixel(camera, (0, 0, 1))[0], [100, 30])
     np.testing.assert_allclose(pixel(camera, (1, 0, 0))[0], [120, 50])
     np.testing.assert_allclose(pixel(camera, (5, 0, 0))[0], [200, 50])  # half the field of view

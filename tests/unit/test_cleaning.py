@@ -1,4 +1,4 @@
-"""The faults that are found in an asset."""
+"""Tests which faults are found in an asset."""
 
 import numpy as np
 import pytest

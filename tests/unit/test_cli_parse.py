@@ -1,5 +1,5 @@
-"""The parser of the command line: mistakes of users, and options that every command
-has."""
+"""Tests the parser of the command line: mistakes of users, and options that every
+command has."""
 
 import pytest
 

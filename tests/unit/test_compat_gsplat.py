@@ -1,5 +1,5 @@
-"""gsplat's interface for rasterization: compared with autograd in float64, and used by
-gsplat's own strategies."""
+"""Tests gsplat's interface for rasterization. It is compared with autograd in float64,
+and used by gsplat's own strategies."""
 
 import gc
 import weakref
@@ -31,7 +31,7 @@ CAMERAS = [FIRST]
 for _seed, _shift in (
     (1, 0.1),
     (2, -0.2),
-):  # near the first camera, so that they see the same gaussians
+):  # near the first camera, so that both see the same gaussians
     _viewmat = FIRST.viewmat.copy()
     _viewmat[:3, 3] += _shift
     CAMERAS.append(Camera(_viewmat, FIRST.K * [[1 + _shift], [1], [1]], 23, 19))
@@ -70,13 +70,14 @@ def draw(inputs, cameras, **options):
 
 
 def draw_at(places, inputs, **options):
-    """Draw from the places that `of_cameras` returns."""
+    """Draw from the cameras that `of_cameras` returns."""
     *shape, colors, backgrounds = inputs
     return rasterization(*shape, colors, **places, backgrounds=backgrounds, **options)
 
 
 def expected(inputs, cameras, *, render_mode="RGB", sh_degree=None, antialiased=False):
-    """Return the result of `draw` except the dict, by the reference with autograd."""
+    """Return the result of `draw` except the dict, computed by the reference with
+    autograd."""
     *shape, colors, backgrounds = inputs
     pictures, alphas = [], []
     for camera, background in zip(cameras, backgrounds, strict=True):
@@ -265,8 +266,8 @@ def test_a_pose_is_found_from_a_picture(device):
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("clip", [{}, {"radius_clip": 2.0}], ids=["all", "clipped"])
 def test_cameras_together_give_the_bits_of_each_alone(device, packed, clip):
-    """The poses are trained, because on a GPU a camera alone with a fixed pose has
-    kernels of its own."""
+    """The poses are trained, because on a GPU, a single camera with a fixed pose has
+    separate kernels."""
     options = {"packed": packed, "absgrad": True, "sh_degree": 3, "render_mode": "RGB+ED", **clip}
     inputs = leaves(CAMERAS, 600, dtype=torch.float32, device=device)
     places = of_cameras(CAMERAS, dtype=torch.float32, device=device)
@@ -298,7 +299,8 @@ def test_cameras_together_give_the_bits_of_each_alone(device, packed, clip):
             got = getattr(info["means2d"], name)[of_camera]
             assert torch.equal(got, getattr(info_alone["means2d"], name).view(got.shape))
     for name, t, wanted in zip(scenes.NAMES, inputs[:5], sums, strict=True):
-        if clip and name == "opacities":  # each camera has its own, which torch adds up
+        # each camera has its own opacities, and torch adds their gradients
+        if clip and name == "opacities":
             torch.testing.assert_close(t.grad, wanted)
         else:
             assert torch.equal(t.grad, wanted)
@@ -306,8 +308,8 @@ def test_cameras_together_give_the_bits_of_each_alone(device, packed, clip):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_camera_with_a_fixed_pose_gives_the_same(device, packed):
-    """The picture has the same bits. The last bits of gradients may differ on a GPU,
-    where other kernels compute them, with contraction."""
+    """The picture has the same bits. On a GPU, the last bits of gradients may differ,
+    because other kernels compute them, with contraction."""
     options = {"packed": packed, "absgrad": True, "sh_degree": 3, "render_mode": "RGB+ED"}
     results = []
     for trains_pose in (False, True):
@@ -330,7 +332,7 @@ def test_a_camera_with_a_fixed_pose_gives_the_same(device, packed):
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("for_each_camera", [False, True], ids=["shared", "for each"])
 def test_sets_of_gaussians_are_drawn_apart(device, packed, for_each_camera):
-    """Batch dimensions (2, 2): four sets with two cameras each."""
+    """The batch dimensions (2, 2) mean four sets with two cameras each."""
     cameras = CAMERAS[:2]
     sets = [
         leaves(cameras, 40, sh_degree=1, dtype=torch.float32, device=device, seed=seed)
@@ -410,7 +412,7 @@ def test_cameras_that_are_drawn_in_parts_give_the_same():
 
 @pytest.fixture
 def located(monkeypatch):
-    """Return the tensors of centres in the reference, one per picture; they keep their
+    """Return the tensors of centres in the reference, one per picture. They keep their
     gradients."""
     found, project = [], rasterize_torch.project
 
@@ -592,11 +594,11 @@ def test_no_call_outlives_its_results():
         gc.enable()
 
 
-# Arguments that are refused.
+# Arguments that are rejected.
 
 
 class Shutter(Enum):
-    """Prints itself like gsplat's RollingShutterType."""
+    """Its text is that of gsplat's RollingShutterType."""
 
     GLOBAL, TOP_TO_BOTTOM = range(2)
 
@@ -671,8 +673,8 @@ def test_wrong_kinds_are_refused():
 
 @pytest.fixture
 def gsplat(monkeypatch):
-    """Return the module gsplat, whose CUDA operations that the strategies use are
-    computed with torch."""
+    """Return the module gsplat. Its CUDA operations that the strategies use are
+    replaced by torch operations."""
     gsplat = pytest.importorskip("gsplat")
     from gsplat.strategy import ops
 

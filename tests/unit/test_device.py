@@ -1,5 +1,5 @@
-"""Devices: the helpers of the tests copy arrays to them, and requesting CUDA where it
-is missing is an error."""
+"""Tests devices. The helpers of the tests copy arrays to them, and requesting CUDA
+where it is missing is an error."""
 
 import os
 import re
@@ -86,7 +86,8 @@ def test_missing_device_is_named():
         _device.resolve("cuda")
 
 
-# This is the error of `import torch` without torch, and a core that has a device.
+# The script has the error of `import torch` without torch, and a core that has a
+# device.
 NO_TORCH_SCRIPT = """
 import sys
 sys.modules["torch"] = None
@@ -112,8 +113,8 @@ def test_missing_torch_is_named(tmp_path):
 
 
 class OnDevice:
-    """The attributes that the core reads of an array on a device, without a device.
-    This suffices to be refused."""
+    """The attributes of an array on a device that the core reads. There is no device;
+    the attributes suffice for the array to be rejected."""
 
     def __init__(self, shape, typestr="<f4", strides=None):
         self.shape = shape
@@ -130,7 +131,7 @@ SHAPES = {"means": (4, 3), "quats": (4, 4), "scales": (4, 3), "opacities": (4,),
 
 
 def rows(make, **changes):
-    """Return the core's rows of four gaussians; a function creates each array from its
+    """Return the core's rows of four gaussians. A function creates each array from its
     shape."""
     return _core.Rows(**{name: make(shape) for name, shape in SHAPES.items()} | changes)
 
@@ -154,7 +155,7 @@ def zeros(shape):
     ],
 )
 def test_wrong_arrays_on_a_device_are_named(means, error, message):
-    # It is known that there must be four rows.
+    # The number of rows may be named as 4 or N.
     pattern = re.escape(message).replace(r"\?", "[4N]")
     with pytest.raises(error, match=pattern):
         rows(OnDevice, means=means)
@@ -195,8 +196,8 @@ def test_rows_of_doubles_on_a_device_are_refused():
 
 @pytest.mark.gpu
 def test_rows_that_begin_between_words_are_copied():
-    """The tensor is a part of another one, so the core could not read four floats at
-    once."""
+    """The tensor is a part of another one and is not aligned, so the core could not
+    read four floats at once."""
     many = scenes.gaussians([[0, 0, 1], [1, 2, 3], [4, 5, 6]])
     there, last = many.torch("cuda"), slice(1, None)
     with pytest.raises(ValueError, match="quats, sh: expected memory that is aligned to 16 bytes"):
@@ -235,11 +236,11 @@ def test_build_of_doubles_is_refused():
 @pytest.mark.parametrize(
     ("mib_left", "message"),
     [
-        (64, "out of memory"),  # memory of torch, for the result
+        (64, "out of memory"),  # torch's memory, for the result
         (
             1024,
             r"cuda: out of memory: requested .* MiB, free: .* MiB of .* MiB",
-        ),  # our memory, for scratch
+        ),  # v3dg's memory, for scratch data
     ],
 )
 def test_full_device_is_a_memory_error(mib_left, message):

@@ -1,5 +1,5 @@
-"""Cameras with lens distortion: where gaussians are drawn, and which functions accept
-them."""
+"""Tests cameras with lens distortion: where gaussians are drawn, and which functions
+accept the cameras."""
 
 import math
 import pickle
@@ -15,7 +15,7 @@ from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import Camera, Gaussians, StereoCamera, select
 
 K = np.array([[150.0, 0, 103], [0, 140, 55], [0, 0, 1]])
-# This is the order of OpenCV: k1, k2, p1, p2, k3 to k6.
+# The order is that of OpenCV: k1, k2, p1, p2, k3 to k6.
 LENSES = {
     "barrel": ("OPENCV", (-0.12, 0.01, 1e-3, -2e-3)),
     "pincushion": ("OPENCV", (0.12, 0.02, -1e-3, 1e-3, 0.005)),
@@ -36,7 +36,7 @@ def lens(request):
 
 
 def image_of(camera, point):
-    """Return where a point is in the image, by OpenCV's documentation."""
+    """Return the image of a point, by OpenCV's documentation."""
     x, y, z = point
     if camera.model == "OPENCV_FISHEYE":
         angle = math.atan2(math.hypot(x, y), z)
@@ -56,7 +56,7 @@ def image_of(camera, point):
 
 
 def dots(points, size=1e-4):
-    """White gaussians that are points, apart from a filter."""
+    """Return white gaussians that are points, except for a filter."""
     n = len(points)
     return Gaussians(
         means=np.asarray(points, np.float32),
@@ -143,8 +143,8 @@ def assert_same_bytes_of_color(image, other):
 
 
 def test_cuts_are_fine_enough_everywhere_in_the_image(lens):
-    """No pixel has more px² per steradian than selection assumes, apart from the growth
-    towards the borders, which is ignored for pinholes, too."""
+    """Selection assumes a density of px² per steradian that no pixel exceeds. The
+    growth towards the borders is ignored, as for pinholes."""
     camera = camera_of(lens)
     rng = np.random.default_rng(1)
     center = rng.uniform((1, 1), (camera.width - 1, camera.height - 1), (500, 2))

@@ -1,5 +1,5 @@
-"""Edits of assets: cropping, deleting, dropping outliers, reducing the SH degree, and
-joining."""
+"""Tests edits of assets: cropping, deleting, dropping outliers, reducing the SH degree,
+and joining."""
 
 import numpy as np
 import pytest
@@ -148,7 +148,7 @@ def test_other_things_than_gaussians_are_named():
 
 def test_angles_turn_about_fixed_axes_in_order():
     rotation = rotation_from_quaternion(np.array(quaternion_from_angles((90, 0, 90))))
-    # The first rotation maps y to z, and the second leaves z in place.
+    # The first rotation maps y to z, and the second one does not change z.
     np.testing.assert_allclose(rotation @ (0, 1, 0), (0, 0, 1), atol=1e-12)
     np.testing.assert_allclose(rotation @ (1, 0, 0), (0, 1, 0), atol=1e-12)
     rotation = rotation_from_quaternion(np.array(quaternion_from_angles((0, 90, 0))))

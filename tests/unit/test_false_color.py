@@ -16,7 +16,7 @@ from v3dg.false_color import palette_of
 
 @pytest.mark.parametrize("by", ["level", "cluster"])
 def test_palette_draws_what_a_recoloured_copy_does(device, by):
-    """The bits are the same, also where neighbouring clusters of several instances are
+    """The bits are the same, even where neighbouring clusters of several instances are
     drawn together."""
     rng = np.random.default_rng(21)
     bundle = lod_bundle(rng, blob(rng, 300, sh_degree=2), 16)

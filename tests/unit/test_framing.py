@@ -1,5 +1,5 @@
-"""First views: they show the whole of an object in pictures of any aspect ratio, and a
-room from inside."""
+"""First views show the whole object in pictures of any aspect ratio, and a room from
+inside."""
 
 import numpy as np
 import pytest
@@ -90,8 +90,8 @@ def test_no_picture_of_an_object_is_cut(rng, make, size):
         assert columns.max() < size[0]
         assert rows.min() > 0
         assert rows.max() < size[1]
-    # The first view also leaves little space: the subject nearly fills one dimension of
-    # the picture.
+    # The first view also leaves little space: the subject nearly fills the width or the
+    # height of the picture.
     first = in_pixels(cameras[0], asset.means.astype(float))
     filled = max(np.ptp(first[:, 0]) / size[0], np.ptp(first[:, 1]) / size[1])
     assert filled > 0.75

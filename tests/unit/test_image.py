@@ -1,5 +1,5 @@
-"""`Image` and `RenderedImage`: their planes, missing planes, and when they wait for a
-drawing."""
+"""Tests `Image` and `RenderedImage`: their planes, missing planes, and when they wait
+for a drawing."""
 
 from types import SimpleNamespace
 
@@ -16,7 +16,7 @@ STATS = Stats(12, 7, 3.0, 0.5, 1.5)
 
 
 class Drawing:
-    """A drawing of the core that counts how often it is waited for."""
+    """Replaces a drawing of the core, and counts how often a picture waits for it."""
 
     def __init__(self, *, exceeds_budget=False):
         self.color = COLOR

@@ -1,4 +1,4 @@
-"""File formats by their names, folders of trainers, and sizes of assets on disk;
+"""Tests file formats by their names, folders of trainers, and sizes of assets on disk.
 tests/files has tests of each format."""
 
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""Every number of a user is used, or refused with one line that names it, without a
-cast, a crash or a warning."""
+"""Every number from a user is either used, or rejected with one line that names it,
+without a cast, a crash or a warning."""
 
 import inspect
 import math
@@ -41,10 +41,10 @@ def exported(write, **given):
         write(BUNDLE, folder, **given)
 
 
-# Each function with valid arguments; those that are numbers, or arrays of numbers, are
-# exchanged.
+# Each function with valid arguments. Numbers and arrays of numbers are replaced by
+# wrong ones.
 def drawn_small(camera):
-    """Return a picture for panoramas of any width, which takes no time."""
+    """Return a picture for panoramas of any width, without drawing."""
     shape = (min(camera.height, 64), min(camera.width, 64))
     return v3dg.Image(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), None)
 

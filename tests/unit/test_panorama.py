@@ -1,4 +1,5 @@
-"""Equirectangular pictures: the positions of directions, and no seams."""
+"""Tests equirectangular pictures: the positions of directions, and the absence of
+seams."""
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def test_every_direction_is_in_its_place():
         ],
         axis=-1,
     )
-    # This is the error of bilinear interpolation in a smooth picture.
+    # The error of bilinear interpolation in a smooth picture is of this size.
     np.testing.assert_allclose(2 * image.color - 1, expected, atol=2e-3)
 
 

@@ -1,4 +1,4 @@
-"""Picking: which gaussian a pixel shows."""
+"""Tests picking: which gaussian a pixel shows."""
 
 from dataclasses import replace
 

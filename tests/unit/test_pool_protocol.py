@@ -1,16 +1,16 @@
-"""A model of how a pool settles. All interleavings of its threads are tried.
+"""A model of how a pool settles. The test tries all interleavings of its threads.
 
 The model has three threads of a pool (csrc/residency/pool_shared.h): one settles a view
 and then draws it, one decides, and one reads. A step is what a thread does while it
-holds the lock, or what it does without the lock. Any thread that can do a step may do
-the next one. The view needs a page, and another page below it, which its cut requests
-only once the first page is in the page table of its frame. An earlier frame with
-another view may have left needs about which the pool has not decided yet. That decision
-may load another page, and may raise the tolerance.
+holds the mutex, or what it does without it. Any thread that can do a step may do the
+next one. The view needs a page, and another page below it. Its cut requests the lower
+page only when the upper one is in the page table of its frame. An earlier frame with
+another view may have left needs that the pool has not decided about. That decision may
+load another page, and may raise the tolerance.
 
-`RULES` are the rules by which the pool draws settled views completely. Without any one
-of them, the model finds an interleaving that draws a picture with a missing page or at
-a raised tolerance.
+`RULES` are the rules by which the pool draws settled views completely. If any of them
+is left out, the model finds an interleaving that draws a picture with a missing page or
+at a raised tolerance.
 """
 
 from dataclasses import dataclass, replace
@@ -20,10 +20,11 @@ import pytest
 
 UPPER, LOWER, OTHER = "upper", "lower", "other"
 SETTLED_VIEW, EARLIER_VIEW = "settled", "earlier"
-# The view is settled once the pool has decided about it, and its own frame, whose page
-# table the cut used, missed nothing.
+# The view is settled when the pool has decided about it and no page was missing in the
+# page table of its own frame, which the cut used.
 ABSENT_PAGES = "absent pages"
-# Before it settles, earlier needs are forgotten, and a round in progress is waited for.
+# Before a view is settled, earlier needs are discarded, and a round in progress is
+# waited for.
 CLEAN_START = "clean start"
 RULES = frozenset({ABSENT_PAGES, CLEAN_START})
 
@@ -36,10 +37,10 @@ class Needs:
 
 @dataclass(frozen=True)
 class State:
-    """The data that the threads share, and the position of each thread."""
+    """The data that the threads share, and the next step of each thread."""
 
-    step: str  # position of the thread that settles
-    table: frozenset[str] = frozenset()  # the pages that its frames draw
+    step: str  # the next step of the thread that settles
+    table: frozenset[str] = frozenset()  # the pages in its page table
     num_absent: int = 0  # the pages that its last cut missed
     noted: Needs | None = None
     decided_view: str = ""
@@ -47,12 +48,13 @@ class State:
     has_noted: bool = False
     is_raised: bool = False
     ready: frozenset[str] = frozenset()
-    resident: frozenset[str] = frozenset()  # needs in the slot of the deciding thread
+    # the needs that wait for the deciding thread
+    resident: frozenset[str] = frozenset()
     todo: frozenset[str] = frozenset()
     loading: frozenset[str] = frozenset()
     read: frozenset[str] = frozenset()
     wants_round: bool = False
-    is_served: bool = False  # whether the round in progress is waited for
+    is_served: bool = False  # whether the thread has waited for the round in progress
     round_is_over: bool = False
     is_deciding: bool = False
     decides: Needs | None = None
@@ -60,8 +62,8 @@ class State:
 
 
 def cut(table):
-    """Return the pages that the view requests with this page table; it requests the
-    lower one only below the upper one."""
+    """Return the pages that the view requests with this page table. It requests the
+    lower page only if it has the upper one."""
     return frozenset({UPPER, LOWER}) if UPPER in table else frozenset({UPPER})
 
 
@@ -109,7 +111,7 @@ def settling_steps(state, rules):
 
 
 def deciding_steps(state):
-    """Yield the steps that the deciding thread can do next: it begins or ends a
+    """Yield the steps that the deciding thread can do next. It begins or ends a
     round."""
     if state.is_deciding:
         resident = state.resident | state.loaded
@@ -124,8 +126,8 @@ def deciding_steps(state):
             is_served=False,
         )
         if state.decides is not None:
-            # A page that arrives during this round is noted as missing, because the
-            # needs are read first.
+            # The needs are read first, so a page that arrives during this round is
+            # recorded as missing.
             absent = state.decides.pages - state.resident
             after = replace(
                 after,
@@ -151,7 +153,7 @@ def deciding_steps(state):
 
 
 def reading_steps(state):
-    """Yield the steps that a reading thread can do next: it begins or finishes a
+    """Yield the steps that a reading thread can do next. It begins or finishes a
     page."""
     for page in state.todo - state.loading - state.read - state.loaded - state.resident:
         yield replace(state, todo=state.todo - {page}, loading=state.loading | {page})

@@ -1,5 +1,5 @@
-"""Levels that are refined together: what improves, what stays unchanged, and single
-steps."""
+"""Tests levels that are refined together: what improves, what stays unchanged, and
+single steps."""
 
 import itertools
 import os
@@ -71,8 +71,8 @@ def test_tables_and_level_0_stay(bundle, device):
 
 
 def test_neighbours_stand_together_in_clusters_of_an_earlier_build(bundle, device):
-    """Gaussians move and are dropped, and earlier builds kept the order of the
-    asset."""
+    """Gaussians move and are dropped. Bundles of earlier versions had the gaussians of
+    a cluster in the order of the asset."""
     offset = bundle.clusters.offset
     rng = np.random.default_rng(1)
     order = [first + rng.permutation(last - first) for first, last in itertools.pairwise(offset)]

@@ -1,9 +1,9 @@
-"""Files at URLs that fsspec supports. The needed parts, or whole files, are downloaded
-into a local file without a name.
+"""Opens files at URLs that fsspec supports. The parts that are needed, or whole files,
+are downloaded into a local file without a name.
 
 `names` recognises and displays URLs. `addresses` decides which hosts may be contacted.
 `http` sends requests to web servers and limits the cost of answers; `others` does the
-same for other file systems. `failures` has the error messages, and `opened` manages the
+same for other file systems. `failures` has the error texts, and `opened` manages the
 local files.
 """
 

@@ -1,4 +1,4 @@
-"""Classifies network addresses: a server on the internet must not redirect to an
+"""Classifies network addresses. A server on the internet must not redirect to an
 address of a local network."""
 
 import ipaddress
@@ -9,11 +9,11 @@ _Address: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class Reach(IntEnum):
-    """The part of the world from which an address can be reached. A redirect must not
-    lead to an address with a smaller reach."""
+    """How far the network reaches that an address belongs to. A redirect must not lead
+    to an address with a smaller reach."""
 
     HOST = 0
-    """This machine or its link; also addresses that do not belong to a single host."""
+    """This machine or its link, and addresses that do not belong to a single host."""
     PRIVATE = 1
     """A network that is not part of the internet."""
     PUBLIC = 2
@@ -59,7 +59,7 @@ _WITH_IPV4 = [ipaddress.ip_network(text) for text in ("64:ff9b::/96", "::/96")]
 
 
 def reach_of(address: str) -> Reach:
-    """Return the reach of an IP address; raise ValueError for any other text."""
+    """Return the reach of an IP address. Raise ValueError for any other text."""
     parsed = ipaddress.ip_address(address.partition("%")[0])
     return min(map(_reach_of, _inner(parsed)))
 
@@ -74,8 +74,8 @@ def is_address(host: str) -> bool:
 
 
 def _inner(address: _Address) -> list[_Address]:
-    """Return the IPv4 addresses to which a gateway translates an IPv6 address, or the
-    address itself if it is not translated."""
+    """Return the IPv4 addresses to which a gateway translates an IPv6 address. If it is
+    not translated, return the address itself."""
     if isinstance(address, ipaddress.IPv4Address) or any(address in network for network in _HOST):
         return [address]
     if address.ipv4_mapped is not None:

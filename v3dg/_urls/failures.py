@@ -1,5 +1,5 @@
-"""Converts errors about URLs to errors of the right type, with one line that contains
-no secrets."""
+"""Converts errors about URLs to errors of the right type, with a one-line text that
+contains no secrets."""
 
 import contextlib
 import errno
@@ -15,7 +15,7 @@ _LONGEST = 200  # number of characters of a library's message that are shown
 
 
 class DownloadError(Exception):
-    """The reason why a file cannot be downloaded, and the type of the error that users
+    """A reason why a file cannot be downloaded, and the type of the error that users
     get. The text does not contain the URL."""
 
     def __init__(self, kind: type[OSError] | type[ValueError], text: str) -> None:
@@ -24,9 +24,9 @@ class DownloadError(Exception):
 
 
 def status_error(status: int) -> DownloadError:
-    """Return the problem of an answer whose status code is an error."""
+    """Return the error for an answer with this status code."""
     try:
-        # The server's own phrase is not used, as it may be any text.
+        # The server's own phrase is not used, because it may be any text.
         phrase = f"{status} {http.HTTPStatus(status).phrase}"
     except ValueError:
         phrase = str(status)
@@ -52,15 +52,15 @@ def _kind_of_status(status: int) -> tuple[type[OSError], str]:
 
 @contextlib.contextmanager
 def naming_errors(url: str) -> Iterator[None]:
-    """Convert any error of a package for URLs to a one-line error, without the secrets
-    in its text."""
+    """Convert any error of a package for URLs to a one-line error, and remove the
+    secrets from its text."""
     try:
         yield
     except (ImportError, MemoryError):
         raise
     except Exception as error:
-        # The original error is not chained: its text, and those of its causes, may
-        # contain the whole URL.
+        # The original error is not chained, because its text and those of its causes
+        # may contain the whole URL.
         raise _failure_of(url, error) from None
 
 
@@ -73,8 +73,8 @@ def _failure_of(url: str, error: Exception) -> Exception:
 
 
 def _problem_of(url: str, error: Exception) -> DownloadError:
-    """Return the problem that caused an error of the system, of fsspec or of aiohttp.
-    The types of aiohttp are recognised by their names, because aiohttp may not be
+    """Return the DownloadError for an error of the system, of fsspec or of aiohttp. The
+    types of aiohttp are recognised by their names, because aiohttp may not be
     installed."""
     names = {kind.__name__ for kind in type(error).__mro__}
     cause = error
@@ -121,8 +121,8 @@ def _problem_of_connection(error: Exception, text: str) -> DownloadError:
 
 
 def _problem_of_answer(names: set[str]) -> DownloadError | None:
-    """Return the problem of an incomplete or invalid answer, by the type names of an
-    error; None for other errors."""
+    """Return the DownloadError for an incomplete or invalid answer, given the type
+    names of an error. Return None for other errors."""
     if "ClientPayloadError" in names:
         return DownloadError(ConnectionError, f"the server's answer was incomplete; {_AGAIN}")
     if names & {"ClientResponseError", "BadHttpMessage"}:
@@ -150,7 +150,7 @@ def _text_of(url: str, error: Exception) -> str:
 
 
 def no_room(folder: str, error: OSError | None = None) -> DownloadError:
-    """Return the problem of a disk that is too full for temporary files."""
+    """Return the DownloadError for a disk that is too full for temporary files."""
     reason = "no space left"
     if error is not None:
         reason = error.strerror or reason

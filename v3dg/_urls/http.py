@@ -1,9 +1,9 @@
-"""Reads files from web servers, which may be hostile: the number of downloaded bytes,
+"""Reads files from web servers, which may be malicious. The number of downloaded bytes,
 the waiting time and the memory are limited to what a request needs.
 
 aiohttp sends the requests on the event loop of fsspec, without compression. This module
-follows redirects itself and checks each host before contacting it. Addresses are
-checked again when a connection is made, because the name may have changed its address.
+follows redirects itself, and checks each host before contacting it. Addresses are
+checked again when a connection is made, because the address of a name may have changed.
 """
 
 import asyncio
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 PATIENCE_S = 30.0
-"""Time limit in seconds until an answer begins, including redirects, and for each
-`STEP_BYTES` of the answer."""
+"""Time limit in seconds. It applies to the time until an answer begins, including
+redirects, and to each `STEP_BYTES` of the answer."""
 
 STEP_BYTES = 128 << 10
 
@@ -60,7 +60,7 @@ class _RequestOptions(TypedDict, total=False):
 
 
 class HttpFileSystem(Protocol):
-    """The part of fsspec's web file system that this module uses; fsspec has no
+    """The part of fsspec's web file system that this module uses. fsspec has no
     types."""
 
     client_kwargs: _SessionOptions
@@ -111,20 +111,21 @@ class WebSource:
     """A file on a web server. Methods may be called from any thread.
 
     Attributes:
-        num_bytes: Size of the file in bytes; None if the server does not send it.
-        tag: Text that changes when the content changes; empty if the server sends none.
+        num_bytes: Size of the file in bytes, or None if the server does not send it.
+        tag: Text that changes when the content changes. It is empty if the server sends
+            none.
     """
 
     def __init__(self, file_system: HttpFileSystem, address: str) -> None:
         self._aiohttp: ModuleType = _extras.load("aiohttp")
         try:
             url = file_system.encode_url(address)
-        except ValueError:  # the message may contain a part of a password
+        except ValueError:  # the error text may contain a part of a password
             raise _wrong_url() from None
         if not url.host:
             raise _wrong_url()
         self._url = url.with_user(None).with_fragment(None)
-        # Users may set headers in fsspec. Only the host of the original URL receives
+        # Users can set headers in fsspec. Only the host of the original URL receives
         # them.
         session = file_system.client_kwargs
         request = file_system.kwargs
@@ -135,7 +136,7 @@ class WebSource:
         self._ssl = request.get("ssl", True)
         self._proxy = request.get("proxy")
         self._trust_env = bool(session.get("trust_env", False))
-        # Reach of the first host; None until it is known.
+        # Reach of the first host, or None until it is known.
         self._reach: Reach | None = None
         self._gives_parts = False
         info = _run(self._info())
@@ -143,19 +144,23 @@ class WebSource:
         self.tag = info.tag
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes of all parts (offset of the first byte, offset after the
-        last). Return whether the server sent the whole file instead."""
+        """Write the bytes of all parts. A part has the offset of its first byte, and
+        the offset after its last byte. Return whether the server sent the whole file
+        instead."""
         return _run(self._read_parts(parts, write))
 
     def read_all(self, max_bytes: int, write: Write) -> int:
-        """Write the whole file, of at most `max_bytes`, and return its size."""
+        """Write the whole file, which must have at most `max_bytes`.
+
+        Return its size.
+        """
         return _run(self._read_all(max_bytes, write))
 
     async def _info(self) -> _FileInfo:
         async with self._answer("HEAD") as answer:
             if answer.status == 200 and answer.content_length is not None:
                 return _FileInfo(answer.content_length, _tag_of(answer))
-        # Some servers do not support HEAD, and some signatures are valid only for GET.
+        # Some servers do not support HEAD, and some signatures are only valid for GET.
         async with self._answer("GET", "bytes=0-0") as answer:
             if answer.status == 200:
                 return _FileInfo(answer.content_length, _tag_of(answer))
@@ -224,8 +229,8 @@ class WebSource:
 
     @contextlib.asynccontextmanager
     async def _answer(self, method: str, part: str = "") -> "AsyncIterator[ClientResponse]":
-        """Yield the first answer that is not a redirect, once its headers have arrived.
-        The caller may read the body."""
+        """Yield the first answer that is not a redirect, as soon as its headers have
+        arrived. The caller may read the body."""
         headers: dict[str, str] = {}
         if part:
             headers["Range"] = part
@@ -239,7 +244,7 @@ class WebSource:
                 )
             yield answer
         finally:
-            answer.close()  # also ends endless bodies
+            answer.close()  # this also ends endless bodies
 
     async def _follow(self, method: str, headers: Mapping[str, str]) -> "ClientResponse":
         url = self._url
@@ -291,8 +296,8 @@ class WebSource:
 
 
 def _run(work: Coroutine[None, None, T]) -> T:
-    """Run a coroutine on the event loop of fsspec. An interrupt of this thread cancels
-    it."""
+    """Run a coroutine on the event loop of fsspec. If this thread is interrupted,
+    cancel it."""
     future = asyncio.run_coroutine_threadsafe(work, _extras.load("fsspec.asyn").get_loop())
     try:
         return future.result()
@@ -343,8 +348,8 @@ def _entry(host: str, port: int, address: str) -> "ResolveResult":
 
 
 async def _checked(url: "URL", least_reach: Reach | None) -> Reach:
-    """Return the reach of a host, the largest reach of its addresses; raise an error if
-    it is below `least_reach`."""
+    """Return the reach of a host, which is the largest reach of its addresses. Raise an
+    error if it is below `least_reach`."""
     host = url.host
     port = url.port
     assert host is not None
@@ -423,7 +428,7 @@ async def _read(answer: "ClientResponse", first: int, last: int, write: Write) -
 
 
 async def _read_to_end(answer: "ClientResponse", first: int, max_bytes: int, write: Write) -> int:
-    """Write a body of at most `max_bytes` and return its size. Each `STEP_BYTES` must
+    """Write a body of at most `max_bytes`, and return its size. Each `STEP_BYTES` must
     arrive within `PATIENCE_S`."""
     num_bytes = 0
 

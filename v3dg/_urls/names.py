@@ -12,31 +12,34 @@ _SECRET = re.compile(r"[@?#]")
 
 
 def is_url(path: str | os.PathLike[str]) -> bool:
-    """Return whether a name is a URL; the name of an existing local file is not."""
+    """Return whether a name is a URL. The name of an existing local file is not one."""
     return bool(_URL.match(os.fspath(path))) and not os.path.lexists(path)
 
 
 def full(path: str | os.PathLike[str]) -> str:
-    """Return a complete URL; restore the slash that is missing if it was a `Path`."""
+    """Return a complete URL.
+
+    If it was converted to a `Path`, restore the missing slash.
+    """
     return _URL.sub(_with_slashes, os.fspath(path), count=1)
 
 
 def shown(path: str | os.PathLike[str]) -> str:
-    """Return the name of a file for messages and results; for a URL, omit parts that
-    may be secret."""
+    """Return the name of a file for messages and results. Parts of a URL that may be
+    secret are omitted."""
     if is_url(path):
         return _without_secrets(full(path))
     return os.fspath(path)
 
 
 def cleaned(text: str) -> str:
-    """Return the text of another program or server; URLs in it are shown without parts
+    """Return the text of another program or server. URLs in it are shown without parts
     that may be secret."""
     return _URL_IN_TEXT.sub(_cleaned_match, text)
 
 
 def beside(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a local file; for a URL, return the file's name as a path in
+    """Return the path of a local file. For a URL, return the file's name as a path in
     the working directory."""
     if not is_url(path):
         return Path(path)
@@ -44,8 +47,8 @@ def beside(path: str | os.PathLike[str]) -> Path:
 
 
 def folder_of(path: str | os.PathLike[str]) -> str:
-    """Return the name of the folder that contains a local file or a file at a URL;
-    empty for the root."""
+    """Return the name of the folder that contains a local file or a file at a URL. For
+    the root, it is empty."""
     if not is_url(path):
         return Path(path).resolve().parent.name
     return os.path.basename(os.path.dirname(unquote(_place_of(full(path))[1])))

@@ -1,5 +1,5 @@
-"""Files at URLs that this process has opened. The parts that are used are downloaded
-once, into a local file without a name."""
+"""The files at URLs that this process has opened. The parts that are used are
+downloaded once, into a local file without a name."""
 
 import contextlib
 import os
@@ -22,34 +22,34 @@ from v3dg._urls.others import OtherSource
 
 Source: TypeAlias = WebSource | OtherSource
 
-# Size of a block, the smallest unit that is downloaded; pages are much larger.
+# Size of a block, the smallest unit that is downloaded. Pages are much larger.
 _BLOCK_BYTES = 1024
 _MOST_BLOCKS = 1 << 12  # number of blocks in a piece, the largest unit of a request
 _MOST_PIECES = 8  # number of pieces that are requested at once
-# Maximum size of a file whose server does not send the size.
+# Maximum size of a file if the server does not send the size.
 _MOST_UNKNOWN_BYTES = 2 << 30
 # Number of bytes that must stay free on the disk of temporary files.
 _SPARE_BYTES = 256 << 20
-# Number of files that are kept open for later use. Files in use are not counted.
+# Number of files that are kept open for later use. Files in use do not count.
 _MOST_OPENED = 256
-_COPIED_BYTES = 1 << 20  # bytes that are copied at once
-# The USD library selects the format by the end of the name.
+_COPIED_BYTES = 1 << 20  # number of bytes that are copied at once
+# The USD library selects the format by the end of the file name.
 _NEEDS_NAME = (".usd", ".usda", ".usdc", ".usdz")
 
 _opened: dict[str, "FileAtUrl"] = {}
 
 
 def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUrl":
-    """Open a file at a URL without downloading it yet. Return the name of a local file
-    unchanged.
+    """Open a file at a URL without downloading it yet. The name of a local file is
+    returned unchanged.
 
-    If the server reports that a file is unchanged, it is not downloaded again.
+    If the server reports that a file has not changed, it is not downloaded again.
 
     Raises:
         ImportError: The extra `fsspec`, or a package that fsspec needs for this kind of
             URL, is not installed.
-        ValueError: The URL is not that of a file, the file refers to other files, or it
-            is inside another file.
+        ValueError: The URL does not belong to a file, the file refers to other files,
+            or it is inside another file.
         FileNotFoundError, PermissionError, TimeoutError, ConnectionError, OSError: The
             file cannot be downloaded.
     """
@@ -122,14 +122,14 @@ def _copy(descriptor: int, path: str) -> None:
 
 class FileAtUrl(os.PathLike[str]):
     """A file at a URL. The parts that are used are downloaded once into a local file
-    without a name, of which nothing remains on disk, however the process ends.
+    without a name. Nothing of it remains on the disk, however the process ends.
 
     Attributes:
-        file: The local file. Bytes that are not downloaded yet are 0, or missing at the
-            end.
+        file: The local file. Bytes that have not been downloaded yet are 0, or missing
+            at the end.
         num_bytes: Size of the file at the URL in bytes.
-        tag: Text that changes when the content at the URL changes; empty if the server
-            sends none.
+        tag: Text that changes when the content at the URL changes. It is empty if the
+            server sends none.
         needs_name: Whether the reader for this format depends on the end of the name.
     """
 
@@ -143,7 +143,7 @@ class FileAtUrl(os.PathLike[str]):
         weakref.finalize(self, self.file.close)
         self._lock = threading.Lock()
         self._is_whole = False
-        # For each piece, whether each of its blocks is downloaded.
+        # For each piece, whether each of its blocks has been downloaded.
         self._is_fetched: dict[int, NDArray[np.bool_]] = {}
         self.num_bytes = -1
         if source.num_bytes is None:  # without the size, parts cannot be requested
@@ -156,12 +156,12 @@ class FileAtUrl(os.PathLike[str]):
 
     @contextlib.contextmanager
     def named(self) -> Iterator[str]:
-        """Yield the name of a local file with the whole content, valid inside the
-        context. Raises the errors of `fetch`.
+        """Yield the name of a local file with the whole content, which is valid inside
+        the context. Raise the errors of `fetch`.
 
         The name refers to an open file of this process. If the reader depends on the
-        end of the name, it is a symbolic link to that file, which is removed
-        afterwards. Without /proc, it is a copy of the file, which is removed, too.
+        end of the name, it is a symbolic link to that file; without /proc, it is a copy
+        of the file. The link or the copy is removed afterwards.
         """
         self._fetch_whole()
         name = f"/proc/self/fd/{self.file.fileno()}"
@@ -179,8 +179,8 @@ class FileAtUrl(os.PathLike[str]):
             yield local
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
-        """Download the bytes of all parts (offset of the first byte, offset after the
-        last). May be called from any thread.
+        """Download the bytes of all parts. A part has the offset of its first byte, and
+        the offset after its last byte. Any thread may call this.
 
         Raises:
             OSError: The bytes cannot be downloaded, or the disk is full.
@@ -207,8 +207,8 @@ class FileAtUrl(os.PathLike[str]):
                 is_fetched[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
 
     def _missing(self, parts: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Return the runs of blocks that are needed for the parts and are not
-        downloaded yet; no run is longer than a piece."""
+        """Return the runs of blocks that the parts need and that have not been
+        downloaded yet. No run is longer than a piece."""
         is_needed: dict[int, NDArray[np.bool_]] = {}
         for first, last in parts:
             expected = f"a part within its {self.num_bytes} bytes, got {first} to {last}"

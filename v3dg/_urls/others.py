@@ -1,4 +1,4 @@
-"""Reads files from the other file systems that fsspec supports, apart from the web."""
+"""Reads files from those file systems of fsspec that are not web servers."""
 
 import contextlib
 import re
@@ -20,7 +20,7 @@ _TAG = re.compile(
 
 
 class FileSystem(Protocol):
-    """The part of a file system of fsspec that this module uses; fsspec has no
+    """The part of a file system of fsspec that this module uses. fsspec has no
     types."""
 
     async_impl: bool
@@ -38,10 +38,10 @@ class OtherSource:
     """A file in a file system of fsspec.
 
     Attributes:
-        num_bytes: Size of the file in bytes; None if it is unknown until the whole file
-            is read.
-        tag: Text that changes when the content changes; empty if the file system has
-            none.
+        num_bytes: Size of the file in bytes, or None if it is unknown until the whole
+            file has been read.
+        tag: Text that changes when the content changes. It is empty if the file system
+            has none.
     """
 
     def __init__(self, file_system: FileSystem, path: str) -> None:
@@ -52,14 +52,16 @@ class OtherSource:
             self.tag = str(info)
         self._file_system = file_system
         self._path = path
-        # Only asynchronous file systems may be used by several threads at once.
+        # Only asynchronous file systems may be used by several threads at the same
+        # time.
         self._lock: AbstractContextManager[object] = threading.Lock()
         if file_system.async_impl:
             self._lock = contextlib.nullcontext()
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes of all parts (offset of the first byte, offset after the
-        last). Return whether the file system sent the whole file instead."""
+        """Write the bytes of all parts. A part has the offset of its first byte, and
+        the offset after its last byte. Return whether the file system sent the whole
+        file instead."""
         firsts = [first for first, _ in parts]
         lasts = [last for _, last in parts]
         with self._lock:
@@ -76,7 +78,10 @@ class OtherSource:
         return False
 
     def read_all(self, max_bytes: int, write: Write) -> int:
-        """Write the whole file, of at most `max_bytes`, and return its size."""
+        """Write the whole file, which must have at most `max_bytes`.
+
+        Return its size.
+        """
         num_bytes = 0
         with self._lock, self._file_system.open(self._path, "rb") as file:
             while data := file.read(_STEP_BYTES):
@@ -88,7 +93,7 @@ class OtherSource:
 
 
 def changed(first: int, last: int, num_bytes: int) -> DownloadError:
-    """Return the problem of a part whose length is not the requested one."""
+    """Return the DownloadError for a part whose length is not the requested one."""
     text = (
         f"expected {last - first} bytes at offset {first}, got {num_bytes}; the file has changed, "
         "open it again"
@@ -97,7 +102,7 @@ def changed(first: int, last: int, num_bytes: int) -> DownloadError:
 
 
 def too_long(max_bytes: int) -> DownloadError:
-    """Return the problem of a file that is larger than allowed."""
+    """Return the DownloadError for a file that is larger than allowed."""
     return DownloadError(
         ValueError,
         f"expected at most {max_bytes} bytes, got more; check the address, or download the file",

@@ -31,12 +31,12 @@ from v3dg.bundle.pages import (
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
-_RUN_BYTES = 64 << 20  # bytes of pages that are encoded together
+_RUN_BYTES = 64 << 20  # number of bytes of pages that are encoded together
 
 
 class Bundle:
-    """All clusters of all levels of one asset, in memory, or in a file whose pages are
-    read on demand.
+    """All clusters of all levels of one asset. They are in memory, or in a file whose
+    pages are read on demand.
 
     Attributes:
         config: The settings of the build as a JSON object.
@@ -46,9 +46,9 @@ class Bundle:
             gaussians when the bundle is created; docs/format.md lists the errors.
 
     Raises:
-        ValueError: The tables are inconsistent with each other or with the gaussians,
-            or do not guarantee an exact cut; ``config`` is not JSON; or the codec is
-            unknown or cannot represent a value.
+        ValueError: The tables contradict each other or the gaussians, or do not
+            guarantee an exact cut; ``config`` is not JSON; or the codec is unknown or
+            cannot represent a value.
     """
 
     def __init__(
@@ -62,8 +62,8 @@ class Bundle:
         check_type("clusters", clusters, Clusters, "Clusters")
         check_type("groups", groups, Groups, "Groups")
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
-        # The tables are constructed again, because tables that were unpickled have not
-        # been checked, and their arrays are writable.
+        # The tables are constructed again, because unpickled tables have not been
+        # checked, and their arrays are writable.
         clusters = replace(clusters)
         groups = replace(groups)
         check_tables(clusters, groups, len(gaussians))
@@ -101,10 +101,11 @@ class Bundle:
     def of_pages(
         cls, clusters: Clusters, groups: Groups, config: JsonObject, pages: Pages
     ) -> Bundle:
-        """Return a bundle with these pages, which are read when they are needed.
+        """Return a bundle with these pages. They are read when they are needed.
 
         Raises:
-            ValueError: The tables are inconsistent, or do not guarantee an exact cut.
+            ValueError: The tables contradict each other, or do not guarantee an exact
+                cut.
         """
         clusters = replace(clusters)
         check_tables(clusters, groups, int(clusters.offset[-1]))
@@ -114,8 +115,8 @@ class Bundle:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
-        """Open a bundle file. Its header and tables are read and checked; its gaussians
-        stay on disk until they are used.
+        """Open a bundle file. Its header and tables are read and checked. Its gaussians
+        stay on the disk until they are used.
 
         The file stays open, so saving another file over it does not change this bundle.
         With the extra `fsspec`, the file may be at a URL. Only the parts that are used
@@ -124,8 +125,8 @@ class Bundle:
         Raises:
             FileNotFoundError: The file does not exist.
             ValueError: The file is not a bundle, has a newer version, or is damaged;
-                the message names the file and the field. Damaged gaussians are detected
-                when they are read.
+                the message names the file and the field. Damaged gaussians are only
+                detected when they are read.
         """
         return cls.open_all([in_parts(path)])[0]
 
@@ -140,14 +141,15 @@ class Bundle:
         reader = _core.HashedReader()
         paths = list(paths)
         try:
-            # More threads than processors are useful, because disks process several
+            # There are more threads than processors, because disks process several
             # requests at once.
             return on_threads(
                 lambda path: cls._open(BundleFile(path, reader)), paths, max_threads=8
             )
         except (OSError, ValueError):
             for path in paths[:-1]:
-                cls.open_all([path])  # raises the error of this file if it is invalid
+                # this raises the error of the file if it is invalid
+                cls.open_all([path])
             raise
 
     @classmethod
@@ -157,8 +159,7 @@ class Bundle:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
-            # The number of gaussians must be checked before any size is computed from
-            # it.
+            # Check the number of gaussians before any size is computed from it.
             max_gaussians = file.pages_bytes // file.codec.gaussian_bytes
             expected = f"at most {max_gaussians} gaussians, got {num_gaussians}"
             check("clusters.offset[-1]", num_gaussians <= max_gaussians, expected)
@@ -168,7 +169,8 @@ class Bundle:
             bundle = cls.__new__(cls)
             cls._set(bundle, clusters, groups, file.config, pages, file)
         except ValueError as error:
-            # Inconsistent tables are mostly due to damage, which `verify` reports.
+            # If tables contradict each other, they are usually damaged, which `verify`
+            # reports.
             file.verify()
             raise ValueError(f"{file.path}: {error}") from None
         file.verify()  # last, because the tables are hashed while they are checked
@@ -197,8 +199,8 @@ class Bundle:
             plan.write_header(file.fileno())
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        """Pickle a bundle in memory completely. A bundle in a file is pickled as its
-        path; unpickling opens the file."""
+        """Pickle a bundle. If it is in memory, the pickle contains all of it. If it is
+        in a file, the pickle contains the path, and unpickling opens the file."""
         path = self.path
         if path is not None:
             if not is_url(path):
@@ -218,22 +220,22 @@ class Bundle:
 
     @property
     def path(self) -> str | None:
-        """Name or complete URL of the bundle's file; None for a bundle in memory."""
+        """Name or complete URL of the bundle's file, or None for a bundle in memory."""
         if self._file is None:
             return None
         return self._file.name
 
     @property
     def num_levels(self) -> int:
-        """Number of levels; 0 for a bundle without clusters."""
+        """Number of levels. It is 0 for a bundle without clusters."""
         if not len(self.clusters):
             return 0
         return int(self.clusters.level[-1]) + 1
 
     @property
     def num_pages(self) -> int:
-        """Number of pages. Page g contains the clusters that group g replaces; the last
-        page contains the last level."""
+        """Number of pages. Page g contains the clusters that group g replaces, and the
+        last page contains the last level."""
         return self._layout.num_pages
 
     @property
@@ -271,7 +273,7 @@ class Bundle:
 
     @property
     def num_leaves(self) -> int:
-        """Number of gaussians of level 0; 0 for a bundle without levels."""
+        """Number of gaussians of level 0. It is 0 for a bundle without levels."""
         end = np.searchsorted(self.clusters.level, 1)
         return int(self.clusters.offset[end])
 
@@ -316,7 +318,7 @@ class Bundle:
 
     @property
     def is_in_memory(self) -> bool:
-        """Whether all gaussians are in memory; if not, they are read page by page."""
+        """Whether all gaussians are in memory. If not, they are read page by page."""
         return isinstance(self._pages, MemoryPages | CodePages)
 
     @property
@@ -329,7 +331,7 @@ class Bundle:
 
     def read_page(self, page: int) -> Gaussians:
         """Return the gaussians of a page, after verifying its hash. Page g contains the
-        clusters that group g replaces; the last page contains the coarsest level, which
+        clusters that group g replaces. The last page contains the coarsest level, which
         no group replaces."""
         check_index("page", page, self.num_pages)
         return self._pages.read(page, page + 1)
@@ -364,12 +366,12 @@ class Bundle:
 
     @property
     def pages(self) -> Pages:
-        """The pages, in memory or read when they are needed."""
+        """The pages. They are in memory, or are read when they are needed."""
         return self._pages
 
     def pages_of(self, clusters: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the indices of the pages that contain clusters, each once, ascending.
-        The clusters must be in ascending order."""
+        """Return the indices of the pages that contain clusters, each once and in
+        ascending order. The clusters must be in ascending order."""
         pages = np.searchsorted(self._layout.first_cluster, clusters, side="right") - 1
         return np.unique(pages)
 
@@ -382,8 +384,8 @@ class Bundle:
         return Gaussians.concatenate(pieces)
 
     def cluster_gaussians(self, cluster: int) -> Gaussians:
-        """Return the gaussians of one cluster. The cluster's page is cached until
-        another page is read."""
+        """Return the gaussians of one cluster. Its page is cached until another page is
+        read."""
         check_index("cluster", cluster, len(self.clusters))
         page = int(np.searchsorted(self._layout.first_cluster, cluster, side="right")) - 1
         first = int(self._layout.first_gaussian[page])
@@ -392,9 +394,8 @@ class Bundle:
         return self.read_page(page).subset(slice(start, stop))
 
     def level_gaussians(self, level: int) -> Gaussians:
-        """Return the gaussians of a level; only the pages of that level are read. The
-        gaussians of level 0 have `antialiased` set if the asset was trained with
-        antialiasing."""
+        """Return the gaussians of a level. Only the pages of that level are read. At
+        level 0, `antialiased` is True if the asset was trained with antialiasing."""
         clusters = self.level_range(level)
         first, last = np.searchsorted(self._layout.first_cluster, [clusters.start, clusters.stop])
         gaussians = self._pages.read(int(first), int(last))
@@ -477,8 +478,8 @@ def _check_page_tables(pages: FilePages, file: BundleFile) -> None:
 
 
 def _mean_of_known(values: NDArray[np.float32]) -> float | None:
-    """Return the mean of all values that are not NaN, which means unknown; None if all
-    are NaN."""
+    """Return the mean of all values that are not NaN. NaN means unknown. If all are
+    NaN, return None."""
     numbers = values[~np.isnan(values)]
     if not numbers.size:
         return None

@@ -15,13 +15,13 @@ from v3dg.gaussians import Gaussians, empty, gaussian_bytes
 
 
 class Codec:
-    """The codec "float32": a page contains the float32 arrays of its gaussians, one
+    """The codec "float32". A page contains the float32 arrays of its gaussians, one
     after another. All gaussians have the same SH degree.
 
     Attributes:
         name: The name in the API and in files.
         alignment: Pages begin at multiples of this number of bytes in the file.
-        gaussian_bytes, cluster_bytes: Size of a page in bytes for each gaussian and
+        gaussian_bytes, cluster_bytes: Number of bytes of a page for each gaussian and
             each cluster.
     """
 
@@ -38,14 +38,14 @@ class Codec:
     def page_bytes(
         self, num_gaussians: NDArray[np.int64], num_clusters: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Return the sizes of pages in bytes, including padding, given their numbers of
-        gaussians and clusters."""
+        """Return the sizes of pages in bytes, including padding. The arguments are
+        their numbers of gaussians and clusters."""
         num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
         return (num_bytes + self.alignment - 1) & -self.alignment  # the alignment is a power of two
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
-        """Return the gaussians after encoding and decoding, on their device. `offset`
-        has the first row of each cluster, and the end."""
+        """Return the gaussians after encoding and decoding, on the same device.
+        `offset` has the first row of each cluster, then the end."""
         return gaussians
 
     def empty(self, count: int) -> Gaussians:
@@ -54,8 +54,8 @@ class Codec:
 
 
 class Quantized(Codec):
-    """The codec "quantized": codes relative to the ranges of a cluster, with 16 bytes
-    per gaussian, and up to 24 more for higher SH degrees."""
+    """The codec "quantized". Its codes are relative to the ranges of a cluster. A
+    gaussian has 16 bytes, and up to 24 more for higher SH degrees."""
 
     name = "quantized"
 
@@ -74,6 +74,6 @@ CODECS: dict[str, type[Codec]] = {codec.name: codec for codec in (Codec, Quantiz
 
 
 def codec_of(name: str, sh_degree: int) -> Codec:
-    """Return the codec with a name; raise ValueError if there is none."""
+    """Return the codec with a name. Raise ValueError if there is none."""
     one_of(name, "codec", tuple(CODECS))
     return CODECS[name](sh_degree)

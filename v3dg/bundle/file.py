@@ -2,8 +2,8 @@
 hashed pages, followed by the tables.
 
 docs/format.md describes the format and the reasons for it. This module checks the
-structure of the file, because the file may be hostile; `v3dg.bundle.tables` checks the
-values in the tables.
+structure of the file, which may be malicious. `v3dg.bundle.tables` checks the values in
+the tables.
 """
 
 import os
@@ -32,12 +32,12 @@ from v3dg.bundle.pages import PageLayout, PageRun
 from v3dg.bundle.tables import Clusters, Column, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
-# Size of the beginning of the header, which a disk writes atomically.
+# Size of the beginning of the header. A disk writes this many bytes atomically.
 _FIRST_BYTES = 4096
-# Maximum size of the tables of a file at a URL, because their size is only a claim
-# until they are downloaded. The tables of a billion gaussians are smaller.
+# Maximum size of the tables of a file at a URL. Their size is only a claim until they
+# have been downloaded. The tables of a billion gaussians are smaller.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
-# Number of clusters that may be empty; each further cluster has at least one gaussian.
+# Number of clusters that may be empty. All others must have at least one gaussian.
 _FREE_CLUSTERS = 1 << 18
 
 
@@ -68,7 +68,7 @@ class BundlePlan:
     def write_tables(
         self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
     ) -> None:
-        """Check the tables and write them behind the pages; `hashes` (P, 16) are those
+        """Check the tables, and write them after the pages. `hashes` (P, 16) are those
         of the pages."""
         check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
         tables = self._page_tables | columns_of(clusters, groups) | {"pages.hash": hashes}
@@ -81,8 +81,8 @@ class BundlePlan:
         _files.write_at(descriptor, end, self._pages_end)
 
     def write_header(self, descriptor: int) -> None:
-        """Write the header. Its first bytes are written last, so a file that begins
-        with them is complete."""
+        """Write the header. Its first bytes are written last, so if a file begins with
+        them, it is complete."""
         _files.write_at(descriptor, self.header[_FIRST_BYTES:], _FIRST_BYTES)
         _files.write_at(descriptor, self.header[:_FIRST_BYTES], 0)
 
@@ -94,8 +94,8 @@ def write_pages(
     codec: Codec,
     gaussians: Gaussians,
 ) -> NDArray[np.uint8]:
-    """Write the gaussians of neighbouring pages, which may be on any device, at their
-    positions in the file. Return (n, 16) the hashes of the pages."""
+    """Write the gaussians of neighbouring pages to their positions in the file. The
+    gaussians may be on any device. Return (n, 16) the hashes of the pages."""
     rows = gaussians.numpy().rows
     return _core.write_pages(os.fspath(path), descriptor, rows, codec.name, run.core)
 
@@ -107,7 +107,7 @@ def read_pages(
     codec: Codec,
     hashes: NDArray[np.uint8],
 ) -> Gaussians:
-    """Return the gaussians of neighbouring pages; raise ValueError if the file is too
+    """Return the gaussians of neighbouring pages. Raise ValueError if the file is too
     short or a hash differs."""
     result = codec.empty(run.rows.stop - run.rows.start)
     _core.read_pages(
@@ -117,15 +117,15 @@ def read_pages(
 
 
 class BundleFile:
-    """An open bundle file. Its header and tables are read at once, and its pages on
-    demand; `verify` checks the hash of header and tables.
+    """An open bundle file. Its header and tables are read when it is opened, and its
+    pages on demand. `verify` checks the hash of header and tables.
 
-    Never more memory is allocated than the size of the file or, for a URL, the number
-    of downloaded bytes. The file is closed when this object is destroyed.
+    The allocated memory never exceeds the size of the file or, for a URL, the number of
+    downloaded bytes. The file is closed when this object is destroyed.
 
     Attributes:
         name: The name of the file, or its complete URL.
-        path: The name of the file in messages, without secret parts of a URL.
+        path: The name of the file in messages, without the secret parts of a URL.
     """
 
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
@@ -223,8 +223,8 @@ class BundleFile:
         return dict(value)
 
     def _check_entries(self, header: JsonObject) -> dict[str, Entry]:
-        """Compare the header with the header that follows from its own counts and the
-        size of the file; return its entries."""
+        """Compare the header with the one that follows from its own counts and from the
+        size of the file. Return its entries."""
         counts = []
         for name in ("clusters.level", "groups.parent", "pages.offset", "pages"):
             entry = header.get(name)
@@ -268,7 +268,7 @@ class BundleFile:
         self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
     ) -> None:
         """Raise ValueError if the tables of a file at a URL are larger than its
-        gaussians can need; this is checked before the tables are downloaded."""
+        gaussians can need. This is checked before the tables are downloaded."""
         if self._at_url is None:
             return
         limit = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
@@ -310,7 +310,7 @@ class BundleFile:
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
     def verify(self) -> None:
-        """Wait for the hash of the header and tables; raise ValueError if it differs
+        """Wait for the hash of the header and tables. Raise ValueError if it differs
         from the one in the file."""
         if not self._reading.is_sound():
             self._fail(f"hash: does not match the header and the tables; {_core.DAMAGED}")
@@ -328,7 +328,7 @@ class BundleFile:
 
     @property
     def places(self) -> NDArray[np.int64]:
-        """(P+1,) offset of the first byte of each page in the file, and the end of the
+        """(P+1,) offset of the first byte of each page in the file, then the end of the
         pages."""
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
@@ -349,16 +349,16 @@ class BundleFile:
         )
 
     def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
-        """Read neighbouring pages and verify their hashes. `out` is filled with their
-        gaussians or, if it is an integer array, with their codes."""
+        """Read neighbouring pages, and verify their hashes. `out` receives their
+        gaussians or, if it is an integer array, their codes."""
         self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
         _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, run.core)
 
 
 def _length_of_vector(entry: object) -> int | None:
-    """Return the length of a one-dimensional tensor from its header entry; None for any
-    other entry."""
+    """Return the length of a one-dimensional tensor, given its header entry. Return
+    None for any other entry."""
     if not isinstance(entry, dict):
         return None
     shape = entry.get("shape")

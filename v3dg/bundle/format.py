@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from v3dg.bundle.pages import PageLayout
 
 FORMAT = "v3dg"
-VERSION = 3  # the newest version; files are written in this version
+VERSION = 3  # the newest version, in which files are written
 HASH_BYTES = 16
-# A header contains 20 entries and the config. A longer one is damaged or hostile.
+# A header has 20 entries and the config. A longer one is damaged or malicious.
 MAX_HEADER_BYTES = 1 << 20
 
 DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
     # Each row has a name, a safetensors dtype, the number of rows (C clusters, C+1, G
-    # groups, P pages), and the remaining shape. The order is that of the file: wide
+    # groups, P pages), and the remaining shape. The order is that of the file. Wide
     # types come first, so that each table is aligned to its own type.
     ("clusters.offset", "I64", "C+1", ()),
     ("pages.offset", "I64", "P", ()),
@@ -49,8 +49,8 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-# Tables that only float32 files have. In quantised files, they would follow from the
-# other tables.
+# Tables that only float32 files have. For quantised files, they follow from the other
+# tables.
 _ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")
 
 
@@ -80,7 +80,7 @@ def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.ge
 
 
 def offset_of(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (N + 1,) the start of each of N consecutive parts of these sizes, and the
+    """Return (N + 1,) the start of each of N consecutive parts of these sizes, then the
     end of the last part."""
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
 
@@ -94,8 +94,8 @@ def page_hash(pieces: Iterable[NDArray[np.generic]]) -> bytes:
 
 
 def hash_of_pieces(message: bytes) -> bytes:
-    """Return the BLAKE2b-128 hash of a message: the message is split into pieces, which
-    are hashed in parallel, and the result is the hash of their hashes."""
+    """Return the BLAKE2b-128 hash of a message. The message is divided into pieces,
+    which are hashed in parallel. The result is the hash of their hashes."""
     data = np.frombuffer(message, np.uint8)
     size = _core.HASH_PIECE_BYTES
     digests = _core.blake2b(np.split(data, range(size, len(data), size)))
@@ -145,7 +145,7 @@ def header_of(entries: dict[str, Entry], codec: "Codec", config: JsonObject) -> 
 
 
 def config_to_json(config: JsonObject) -> str:
-    """Return the config as JSON; raise TypeError unless it is a dict, and ValueError if
+    """Return the config as JSON. Raise TypeError unless it is a dict, and ValueError if
     JSON cannot represent a value."""
     check_type("config", config, dict, "a dict")
     try:

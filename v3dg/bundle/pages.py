@@ -30,9 +30,9 @@ _MAX_THREADS = min(8, os.cpu_count() or 1)
 @dataclass(frozen=True, eq=False)
 class PageLayout:
     """The division of all clusters into P pages. Page g contains the clusters that
-    group g replaces; the last page contains the last level."""
+    group g replaces, and the last page contains the last level."""
 
-    # (P+1,) index of the first cluster of each page, and the number of clusters.
+    # (P+1,) index of the first cluster of each page, then the number of clusters.
     first_cluster: NDArray[np.int64]
     offset: NDArray[np.int64]  # (C+1,) boundaries of the gaussians of clusters
 
@@ -50,7 +50,7 @@ class PageLayout:
 
     @cached_property
     def first_gaussian(self) -> NDArray[np.int64]:
-        """(P+1,) index of the first gaussian of each page, and the number of
+        """(P+1,) index of the first gaussian of each page, then the number of
         gaussians."""
         return self.offset[self.first_cluster]
 
@@ -69,7 +69,7 @@ class PageLayout:
 
     def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> "PageRun":
         """Return the pages from `first_page` up to, but not including, `last_page`.
-        ``places`` has the offset of each page in a file, and the end of the last page.
+        ``places`` has the offset of each page in a file, then the end of the last page.
         """
         clusters = self.first_cluster[first_page : last_page + 1]
         return PageRun(
@@ -87,11 +87,11 @@ class PageRun:
 
     first_page: int  # index of the first page in the bundle
     # (n+1,) index of the first cluster of each page, relative to the first cluster of
-    # the run, and the number of clusters in the run.
+    # the run, then the number of clusters in the run.
     first_cluster: NDArray[np.int64]
     # Boundaries of the gaussians of all clusters, as indices in the bundle.
     offset: NDArray[np.int64]
-    places: NDArray[np.int64]  # (n+1,) offset of each page in the file, and the end
+    places: NDArray[np.int64]  # (n+1,) offset of each page in the file, then the end
 
     def __len__(self) -> int:
         return len(self.places) - 1
@@ -132,7 +132,7 @@ class MemoryPages:
 
 
 class CodePages:
-    """The pages of a quantised bundle whose codes are all in memory; gaussians are
+    """The pages of a quantised bundle whose codes are all in memory. Gaussians are
     decoded on demand."""
 
     def __init__(self, layout: PageLayout, words: NDArray[np.int32], codec: Codec) -> None:
@@ -144,7 +144,7 @@ class CodePages:
     @staticmethod
     def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> "CodePages":
         """Return the pages of gaussians on the host."""
-        places = offset_of(layout.page_bytes(codec) // 4)  # counted in 32-bit integers
+        places = offset_of(layout.page_bytes(codec) // 4)  # in units of 32-bit integers
         words = np.empty(int(places[-1]), np.int32)
 
         def encode(page: int) -> None:
@@ -170,8 +170,8 @@ class CodePages:
 
 
 class FilePages:
-    """Pages that are read from a file on demand. The most recent page that was read
-    alone is cached."""
+    """Pages that are read from a file on demand. If a page is read alone, it is cached
+    until the next one is."""
 
     def __init__(self, layout: PageLayout, file: "BundleFile") -> None:
         self.layout = layout
@@ -218,8 +218,8 @@ class FilePages:
 
 
 class JoinedPages:
-    """The pages of several other bundles, which are read from those bundles when they
-    are needed."""
+    """Pages that belong to several other bundles. They are read from those bundles when
+    they are needed."""
 
     def __init__(
         self,
@@ -228,9 +228,8 @@ class JoinedPages:
         source: NDArray[np.int64],
         page: NDArray[np.int64],
     ) -> None:
-        """Args:
-        source, page: (P,) for each page, the index of its source, and its index in that
-            source.
+        """Args: source, page: (P,) for each page, the index of its source, and its
+        index in that source.
         """
         self.layout = layout
         self.codec: Codec = sources[0].codec
@@ -278,7 +277,7 @@ def encoded(gaussians: Gaussians, layout: PageLayout, page: int) -> NDArray[np.i
 def on_threads(
     work: Callable[[_Item], _Result], items: Sequence[_Item], max_threads: int = _MAX_THREADS
 ) -> list[_Result]:
-    """Return the results of ``work`` for all items, which several threads compute."""
+    """Return the results of ``work`` for all items. Several threads compute them."""
     if len(items) < 2:
         return list(map(work, items))
     with ThreadPoolExecutor(max_threads) as pool:
@@ -287,7 +286,7 @@ def on_threads(
 
 def runs_that_follow(follows: NDArray[np.bool_]) -> Iterator[range]:
     """Yield the runs of N items in which each item follows the one before it. `follows`
-    has N - 1 flags, of the items after the first."""
+    has N - 1 flags, for all items after the first."""
     starts = [0, *(np.flatnonzero(~follows) + 1).tolist()]
     for start, stop in itertools.pairwise([*starts, len(follows) + 1]):
         yield range(start, stop)
@@ -296,8 +295,8 @@ def runs_that_follow(follows: NDArray[np.bool_]) -> Iterator[range]:
 def runs_of_pages(
     first_page: int, last_page: int, page_bytes: NDArray[np.int64], num_bytes: int
 ) -> Iterator[range]:
-    """Split a range of pages into smaller ranges of about ``num_bytes`` each, which
-    limits the memory for one of them."""
+    """Divide a range of pages into smaller ranges of about ``num_bytes`` each. This
+    limits the memory for processing one of them."""
     ends = np.cumsum(page_bytes[first_page:last_page]) // num_bytes
     cuts = (np.flatnonzero(np.diff(ends)) + first_page + 1).tolist()
     for start, stop in zip([first_page, *cuts], [*cuts, last_page], strict=True):

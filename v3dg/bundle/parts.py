@@ -14,8 +14,8 @@ from v3dg.bundle.pages import JoinedPages, PageLayout
 
 @dataclass(frozen=True, eq=False)
 class BundlePart:
-    """Clusters of neighbouring levels of a bundle, with all clusters on the paths
-    between them, so that they form a separate bundle.
+    """Clusters of neighbouring levels of a bundle. They include all clusters on the
+    paths between them, so that they form a separate bundle.
 
     Attributes:
         clusters: (C,) indices of the clusters, ascending.
@@ -29,11 +29,14 @@ class BundlePart:
     first_level: int
 
     def of(self, bundle: Bundle) -> Bundle:
-        """Return the part of a bundle in memory; only its pages are read."""
+        """Return the part of a bundle, in memory.
+
+        Only the pages of the part are read.
+        """
         clusters = bundle.clusters
         groups = bundle.groups
         sizes = np.diff(clusters.offset)[self.clusters]
-        # The last element is for the group -1, which means none.
+        # The last element is for the group -1, which means no group.
         number = np.full(len(groups) + 1, -1, np.int32)
         number[self.groups] = np.arange(len(self.groups), dtype=np.int32)
         part_clusters = replace(
@@ -61,8 +64,8 @@ class BundlePart:
 @dataclass(frozen=True, eq=False)
 class ReplacedPart:
     """A part of a bundle, and the bundle that replaces its levels from `first_level`
-    on. Levels are counted in the part. Both bundles have the same tables except for the
-    numbers of gaussians and the boxes of the clusters."""
+    on. Levels are counted in the part. Both bundles have the same tables, except for
+    the numbers of gaussians and the boxes of the clusters."""
 
     part: BundlePart
     bundle: Bundle
@@ -70,8 +73,8 @@ class ReplacedPart:
 
 
 def joined(bundle: Bundle, replaced: Iterable[ReplacedPart]) -> Bundle:
-    """Return a bundle with replaced parts. It reads its pages from the bundles in the
-    arguments when they are needed."""
+    """Return a bundle in which parts are replaced. It reads its pages from the bundles
+    in the arguments when they are needed."""
     sizes = np.diff(bundle.clusters.offset)
     box = bundle.clusters.box.copy()
     source = np.zeros(bundle.num_pages, np.int64)
@@ -109,8 +112,8 @@ class Division:
 
 
 def levels_of_at_most(bundle: Bundle, most_gaussians: int) -> BundlePart:
-    """Return the part of a bundle from the first level on that has at most this many
-    gaussians; the last level if there is none."""
+    """Return the part of a bundle that begins with the first level of at most this many
+    gaussians. If there is no such level, it begins with the last one."""
     first = 0
     while first < bundle.num_levels - 1 and _size_of_level(bundle, first) > most_gaussians:
         first += 1
@@ -129,12 +132,12 @@ def divided(bundle: Bundle, most_leaves: int) -> Division | None:
     """Divide a bundle into units of at most `most_leaves` gaussians of level 0, and the
     part above them.
 
-    The part above begins up to six levels lower, with a level of at most `most_leaves`
-    gaussians, with which its others can be compared.
+    The part above begins up to six levels below the top of the units, with a level of
+    at most `most_leaves` gaussians. Its other levels can be compared with this one.
 
     Returns:
-        None for a bundle of at most `most_leaves`, and for one whose groups do not
-        divide it into few such subtrees.
+        None for a bundle of at most `most_leaves`, and if the groups of a bundle do not
+        divide it into few enough such subtrees.
     """
     num_leaves = bundle.num_leaves
     if num_leaves <= most_leaves:
@@ -170,11 +173,10 @@ def divided(bundle: Bundle, most_leaves: int) -> Division | None:
 # The part above the units begins at most this many levels below level `top`. A build
 # also fits a level to the level six below it.
 _LEVELS_BELOW = 6
-# A unit has at least levels 0 and 1, so that the part above it can begin with the
-# latter.
+# A unit has at least levels 0 and 1, so that the part above it can begin with level 1.
 _LEAST_TOP = 2
-# The number of units may exceed the least possible number by this factor. If each group
-# has two parts of equal size, a factor of two is enough.
+# The number of units may exceed the minimum by this factor. If each group has two parts
+# of equal size, a factor of two suffices.
 _MOST_UNITS = 4
 
 
@@ -198,8 +200,8 @@ def _leaves_of_groups(bundle: Bundle) -> NDArray[np.int64]:
 
 
 def _units_of_groups(bundle: Bundle, top: int) -> NDArray[np.int64]:
-    """Return (G,) the number of the group of level `top` that contains each group; -1
-    above that level."""
+    """Return (G,) the number of the group of level `top` that contains each group, or
+    -1 above that level."""
     groups = bundle.groups
     unit = np.full(len(groups) + 1, -1, np.int64)
     of_top = np.flatnonzero(groups.level == top)

@@ -12,29 +12,31 @@ from v3dg._numbers import check, check_type, refuse, value_text, whole_number
 from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
 
-Column: TypeAlias = NDArray[Any]  # the dtype is defined by `bundle.format.SCHEMA`
+Column: TypeAlias = NDArray[Any]  # `bundle.format.SCHEMA` defines the dtype
 
 NESTING_MARGIN = _core.nesting_margin
-"""The relative margin that is added to a group's ball so that, in spite of rounding, it
-contains the balls of the groups below; see docs/format.md."""
+"""The relative margin that is added to a group's ball. With it, the ball contains the
+balls of the groups below in spite of rounding; see docs/format.md."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """The table of C clusters, sorted by level (0 first) and then by position in the
+    """The table of C clusters, sorted by level (0 first), and then by position in the
     tree of the median split. The arrays are read-only.
 
     Attributes:
         offset: (C+1,) int64. Cluster c contains gaussians offset[c] to offset[c+1] - 1.
         level: (C,) int32. Level of the cluster.
-        own_group: (C,) int32. Group that made the cluster; -1 at level 0.
-        parent_group: (C,) int32. Group that replaces the cluster; -1 at the last level.
+        own_group: (C,) int32. Group that made the cluster, or -1 at level 0.
+        parent_group: (C,) int32. Group that replaces the cluster, or -1 at the last
+            level.
         box: (C,2,3) float32. Minimum and maximum corner of the cluster's visible extent
-            in the asset's frame, without the extent that the filter adds.
+            in the asset's frame. The extent that the filter adds is not included.
         filter_px2: (C,) float32. Variance of the cluster's screen-space low-pass
             filter, px². With a fade, clusters of level 0 are drawn with a filter even
             if this is 0.
-        antialiased: (C,) uint8. 1 if opacities are compensated for the filter.
+        antialiased: (C,) uint8. 1 if opacities are compensated for the filter, and
+            otherwise 0.
     """
 
     offset: NDArray[np.int64]
@@ -69,10 +71,10 @@ class Groups:
             contains the balls of the groups below.
         weight: (G,) float32. One over the number of gaussians that the group was
             simplified to, but at least the largest weight of the groups below.
-        parent: (G,) int32. The group above; -1 for groups that made clusters of the
+        parent: (G,) int32. The group above, or -1 for groups that made clusters of the
             last level.
-        level: (G,) int32. Level of the clusters that the group made; at least 1.
-        error: (G,2) float32. Remaining errors of the fit in colour and alpha; NaN if
+        level: (G,) int32. Level of the clusters that the group made, at least 1.
+        error: (G,2) float32. Remaining errors of the fit in colour and alpha, or NaN if
             unknown.
     """
 
@@ -95,8 +97,8 @@ def check_index(name: str, index: int, count: int) -> None:
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
-    """Check dtypes and shapes. Replace writable arrays by read-only copies, so that
-    later changes cannot invalidate the checks."""
+    """Check dtypes and shapes. Writable arrays are replaced by read-only copies, so
+    that later changes cannot invalidate the checks."""
     count = np.size(part.level)
     for name, kind, rows, row_shape in [
         column for column in SCHEMA if column[0].startswith(prefix)
@@ -127,7 +129,7 @@ def columns_of(clusters: Clusters, groups: Groups) -> dict[str, Column]:
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:
-    """Raise ValueError unless the tables are consistent with each other and with the
-    gaussians, and guarantee an exact cut."""
+    """Raise ValueError unless the tables agree with each other and with the gaussians,
+    and guarantee an exact cut."""
     check("clusters", len(clusters) < 1 << 31, f"fewer than 2^31 clusters, got {len(clusters)}")
     _core.check_tables(*columns_of(clusters, groups).values(), num_gaussians=num_gaussians)

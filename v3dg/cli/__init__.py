@@ -1,8 +1,8 @@
 """The command line. Each command has a module that defines its options, calls the
 library and prints the result.
 
-Exit codes: 0 success, 1 failure, 2 wrong usage, 130 interrupt. Errors are one line on
-stderr; results go to stdout.
+Exit codes are 0 for success, 1 for failure, 2 for wrong usage, and 130 for an
+interrupt. Errors are one line on stderr, and results go to stdout.
 """
 
 from v3dg.cli import (

@@ -24,7 +24,7 @@ from v3dg.scene import Subject
 
 
 class UsageError(Exception):
-    """Raised for wrong arguments; the exit code is 2."""
+    """Raised for wrong arguments. The exit code is then 2."""
 
 
 # Exceptions that a command reports as one line on stderr. Any other exception is a bug,
@@ -64,8 +64,8 @@ def tell(text: str) -> None:
 
 
 def option(metavar: str, *aliases: str) -> object:
-    """Return the annotation of an option whose default is None; its help text describes
-    the default."""
+    """Return the annotation of an option whose default is None. Its help text must
+    describe the default."""
     return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
 
 
@@ -79,7 +79,7 @@ class Common:
     """Options that every command has."""
 
     threads: Threads = None
-    """Number of CPU threads; all cores by default."""
+    """Number of CPU threads. The default is the number of cores."""
     json: Flag = False
     """Print the result as JSON."""
     quiet: Flag = False
@@ -89,8 +89,8 @@ class Common:
 @dataclass(kw_only=True)
 class OnDevice(Common):
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device that computes; auto is a CUDA device if torch can use one, otherwise the
-    CPU."""
+    """Device that computes. auto means a CUDA device if torch can use one, and
+    otherwise the CPU."""
 
 
 @dataclass(kw_only=True)
@@ -106,11 +106,11 @@ class Pooled:
 
     memory: Annotated[str, option("SIZE")] = "auto"
     """Memory of the device for pages of bundles, such as 2GB. Pages are read from the
-    files as cameras need them. `all` loads everything; `auto` loads everything if it
+    files as cameras need them. `all` loads everything. `auto` loads everything if it
     fits into the free memory, and otherwise uses half of the free memory."""
 
     def pool(self) -> str | None:
-        """Return the size of the pool as an argument of `Renderer`; None means no
+        """Return the size of the pool as an argument of `Renderer`. None means no
         pool."""
         if self.memory == "all":
             return None
@@ -127,8 +127,8 @@ class Cut:
     """Options for the cut of a bundle or a scene."""
 
     tolerance: Annotated[float | None, option("PX2")] = None
-    """Largest screen area in px² that one gaussian of a coarser cluster may stand for.
-    The default is 3; 0 draws full detail."""
+    """Largest screen area, in px², that one gaussian of a coarser cluster may stand
+    for. The default is 3. 0 draws full detail."""
     budget: Annotated[int | None, option("N")] = None
     """Largest number of gaussians in one picture. Without --tolerance, the picture is
     as fine as the budget allows."""
@@ -145,7 +145,7 @@ def check_range(name: str, value: float, minimum: float, maximum: float) -> None
 
 
 def color_of(value: Color | str) -> Color | None:
-    """Return the colour of --background; None if the value is `none`.
+    """Return the colour of --background, or None if the value is `none`.
 
     Raises:
         UsageError: The value is not a colour.
@@ -194,8 +194,8 @@ def require_file(path: Path, *suffixes: str) -> None:
 
 
 def _similar(path: Path) -> str:
-    """Return advice for a file that does not exist: a similar name in its folder, if
-    there is one."""
+    """Return advice for a file that does not exist. If its folder has a similar name,
+    suggest that name."""
     if path.parent.is_dir():
         names = [name for name in os.listdir(path.parent) if path.with_name(name).exists()]
         similar = difflib.get_close_matches(path.name, names, 1, 0.75)
@@ -205,15 +205,15 @@ def _similar(path: Path) -> str:
 
 
 def open_subject(path: Path, *, show: bool) -> tuple[Subject, dict[str, Camera] | None]:
-    """Open a scene with its cameras, a bundle or an asset. With ``show``, report on
+    """Open a scene with its cameras, a bundle or an asset. With ``show``, print on
     stderr that the file is being read."""
     with waiting(printable(f"reading {shown(path)}"), show=show):
         return open_with_cameras(path)
 
 
 def check_output(output: Path, *inputs: Path) -> None:
-    """Raise an error for an output that is a URL or that would overwrite an input. The
-    input may contain more than the output."""
+    """Raise an error if the output is a URL, or would overwrite an input. The input may
+    contain more than the output."""
     check_usage(shown(output), not is_url(output), "a local file as output, got a URL")
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))
@@ -236,7 +236,7 @@ def level_size(bundle: Bundle, level: int) -> int:
 
 
 def finite(number: float) -> float | None:
-    """Return a number for JSON, which has no infinity; infinity becomes None. A
+    """Return a number for JSON. Infinity becomes None, because JSON has no infinity. A
     tolerance is infinite if the budget is very small."""
     if math.isfinite(number):
         return number
@@ -260,10 +260,10 @@ class Column:
     form: str
 
     def cell(self, row: Mapping[str, object]) -> str:
-        """Return the cell of a row; `-` if the row lacks a value."""
+        """Return the cell of a row, or `-` if the row lacks a value."""
         try:
             return printable(self.form.format_map(row))
-        # The value is missing, or it is None, which has no numeric format.
+        # The value is missing, or it is None and has no numeric format.
         except (KeyError, TypeError):
             return "-"
 

@@ -33,19 +33,19 @@ class EditOptions:
     number scales it, and three more numbers rotate it, in degrees about x, then y, then
     z. Can be repeated."""
     drop_outliers: Flag = False
-    """Drop gaussians that are more than 20 median distances away from the median; `v3dg
+    """Drop gaussians that are more than 20 median distances away from the median. `v3dg
     info` counts them."""
     crop: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, option("SHAPE")] = ()
     """Keep only gaussians in box:X0,Y0,Z0,X1,Y1,Z1 (opposite corners; inf means no
-    limit) or in sphere:X,Y,Z,RADIUS. If repeated, keep only gaussians that are in all
-    of them."""
+    limit) or in sphere:X,Y,Z,RADIUS. If the option is repeated, keep only gaussians
+    that are in all of them."""
     delete: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, option("SHAPE")] = ()
     """Delete gaussians in a box or a sphere, which are specified as for --crop. Can be
     repeated."""
     min_opacity: Annotated[float | None, option("X")] = None
     """Drop gaussians with an opacity below X, from 0 to 1."""
     degree: Annotated[Literal[0, 1, 2, 3] | None, option("{0,1,2,3}")] = None
-    """Write spherical harmonics of this degree. Higher degrees are removed; missing
+    """Write spherical harmonics of this degree. Higher degrees are removed, and missing
     ones are zero, for programs that only read files of degree 3."""
 
     def option_names(self) -> list[str]:
@@ -132,8 +132,8 @@ class Editor:
         return remaining
 
     def result(self) -> dict[str, object]:
-        """Return the counts for the JSON result of a command; empty without editing
-        options."""
+        """Return the counts for the JSON result of a command. Without editing options,
+        there are none."""
         if not self._options.option_names():
             return {}
         return {"added": len(self._options.add), "left_out": dict(self._left_out)}

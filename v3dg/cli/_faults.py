@@ -24,8 +24,8 @@ class FaultOptions:
     drop_bad: Flag = False
     """Leave out gaussians with invalid values, and print how many there are."""
     strict: Flag = False
-    """Fail if the input has invalid values. By default, a .ply keeps values that are
-    not finite, and other formats, which cannot store them, fail."""
+    """Fail if the input has invalid values. By default, values that are not finite are
+    kept in a .ply. Other formats cannot store them, so writing them fails."""
 
     def check(self) -> None:
         """Raise UsageError for options that contradict each other."""
@@ -40,8 +40,8 @@ Faults: TypeAlias = Annotated[FaultOptions, tyro.conf.OmitArgPrefixes]
 
 @dataclass(frozen=True)
 class Checked:
-    """The gaussians to write; the number of gaussians that were left out for each kind
-    of invalid value; and a line about invalid values, which is empty if there are
+    """The gaussians to write, the number of gaussians that were left out for each kind
+    of invalid value, and a line about invalid values. The line is empty if there are
     none."""
 
     gaussians: Gaussians

@@ -16,7 +16,7 @@ _TURNS = "AXIS:DEGREES such as z:90, or quaternion:W,X,Y,Z"
 
 @dataclass(kw_only=True)
 class MoveOptions:
-    """Options for moving gaussians: they are scaled about the origin, then rotated
+    """Options for moving gaussians. They are scaled about the origin, then rotated
     about the origin, then translated. `v3dg info` shows the axes."""
 
     scale: Annotated[float | None, option("S")] = None

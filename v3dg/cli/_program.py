@@ -1,4 +1,4 @@
-"""A program with several commands: parses the command line, runs one command, and
+"""A program with several commands. It parses the command line, runs one command, and
 reports a failure as one line and an exit code."""
 
 import ast
@@ -37,8 +37,8 @@ Commands: TypeAlias = Mapping[str, tuple[type[Options], Callable[[Options], None
 INTERRUPTED = 130  # exit code
 _HELP = ("-h", "--help", "--tyro-write-completion", "--tyro-print-completion")
 
-# More than the number of cores of any machine. A limit is needed because OpenMP ends
-# the process if the system cannot create a thread.
+# More than the number of cores of any machine. There is a limit because OpenMP ends the
+# process if the system cannot create a thread.
 _MOST_THREADS = 1024
 _LEAST_COLUMNS = 40
 
@@ -52,7 +52,10 @@ class Program:
     commands: Commands
 
     def parse(self, arguments: Sequence[str]) -> Options:
-        """Parse the command line; a multi-line error of tyro becomes one line."""
+        """Parse the command line.
+
+        An error of tyro with several lines is shortened to one.
+        """
         if any(argument in _HELP for argument in arguments):
             self.join_help()
         subcommands: list[Options] = [
@@ -85,8 +88,8 @@ class Program:
                 _join_help(kind)
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
-        """Return the message for a wrong command line: about an unknown command or
-        option, or else the text of tyro's first box."""
+        """Return the message for a wrong command line. It is about an unknown command
+        or option, or else it is the text of tyro's first box."""
         if not arguments:
             return f"{_text_of_first_box(boxed)}; run {self.name} --help"
         command = arguments[0]
@@ -98,8 +101,8 @@ class Program:
         return f"{text}; run {self.name} {command} --help"
 
     def _unknown_option(self, command: str, arguments: Sequence[str]) -> str | None:
-        """Return the message for the first option that the command does not have; None
-        if there is none."""
+        """Return the message for the first option that the command does not have, or
+        None."""
         options = self._options(command)
         for argument in arguments:
             name = argument.partition("=")[0].replace("_", "-")
@@ -116,14 +119,14 @@ class Program:
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """Run one command and return its exit code. ``arguments`` are the words of the
-        command line; by default those of this process."""
+        command line. By default, they are those of this process."""
         if arguments is None:
             warnings.showwarning = lambda message, *_, **__: tell(f"v3dg: warning: {message}")
         code = 0
         try:
             code = self._run(arguments)
             code = _flush(code)
-        # The command may be interrupted, or Ctrl-C may be pressed after it has ended.
+        # Either the command was interrupted, or Ctrl-C was pressed after it had ended.
         except KeyboardInterrupt:
             if arguments is not None:
                 raise
@@ -149,7 +152,7 @@ class Program:
                 _set_threads(getattr(options, "threads", None))
                 _start.raise_interrupts()
             next(run for kind, run in self.commands.values() if isinstance(options, kind))(options)
-        except SystemExit:  # raised after the help was printed
+        except SystemExit:  # tyro raises this after it has printed the help
             return 0
         except UsageError as error:
             return _fail(str(error), 2)
@@ -186,7 +189,7 @@ def _join_help(kind: type[Options]) -> None:
 
 @contextlib.contextmanager
 def _legible_width() -> Iterator[None]:
-    """Use at least a minimum width of the terminal, because tyro does not terminate
+    """Increase the width of the terminal to a minimum, because tyro does not terminate
     with 5 columns."""
     if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
         yield
@@ -203,7 +206,7 @@ def _legible_width() -> Iterator[None]:
 
 def _suggestion(name: str, choices: Sequence[str]) -> str:
     """Return the end of a message that suggests the choice most similar to an unknown
-    name; empty if no choice is similar."""
+    name. If no choice is similar, return an empty text."""
     similar = difflib.get_close_matches(name, choices, 1, 0.7)
     if similar:
         return f"; perhaps you meant {similar[0]}"
@@ -239,9 +242,8 @@ def _plainly(text: str) -> str:
 
 
 def _set_threads(threads: int | None) -> None:
-    """Restart this process with a number of threads, because OpenMP reads that number
-    only once, when it is loaded. Without OpenMP, it is read by the first parallel
-    loop."""
+    """Restart this process with a number of threads, because OpenMP only reads that
+    number once, when it is loaded. Without OpenMP, the first parallel loop reads it."""
     if threads is None:
         return
     check_range("--threads", threads, 1, _MOST_THREADS)
@@ -255,13 +257,16 @@ def _set_threads(threads: int | None) -> None:
 
 
 def _flush(code: int) -> int:
-    """Flush stdout and return the exit code, which becomes 1 if flushing fails."""
+    """Flush stdout, and return the exit code.
+
+    If flushing fails, the exit code becomes 1.
+    """
     try:
         sys.stdout.flush()
     except OSError as error:
-        # Python flushes stdout again at exit, and that must not fail.
+        # At exit, Python flushes stdout again, which must not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        # A closed pipe is not reported, because its reader does not want more output.
+        # A closed pipe is not an error, because its reader does not want more output.
         if code == 0 and not isinstance(error, BrokenPipeError):
             return _fail(f"stdout: {error.strerror}", 1)
         return code or 1

@@ -33,7 +33,8 @@ from v3dg.upright import ASSUMED, direction_of, up_of
 _DEFAULT_FOV = 45.0  # degrees
 _DEFAULT_SIZE = (800, 800)
 
-# Limited because all cameras are created before the first picture is drawn.
+# Maximum number of views. There is one because all cameras are created before the first
+# picture is drawn.
 _MOST_VIEWS = 10_000
 
 
@@ -45,11 +46,14 @@ class CameraFile:
     """Use the cameras of this nerfstudio transforms.json, nerfstudio run or COLMAP
     model. `view` offers them together with their photographs."""
     distortion: Literal["draw", "ignore"] = "draw"
-    """Whether pictures have the lens distortion of that file, or it is ignored."""
+    """Whether pictures have the lens distortion of that file.
+
+    `ignore` draws them without it.
+    """
 
     def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
-        """Return the cameras of --cameras; empty without that option. `size` is used if
-        the file has no size."""
+        """Return the cameras of --cameras. Without that option, there are none. `size`
+        is used if the file has no size."""
         if self.cameras is None:
             return {}
         cameras = read_cameras(self.cameras, size=size, distortion=self.distortion)
@@ -65,16 +69,19 @@ class ViewOptions(CameraFile):
     eye: Annotated[tuple[float, float, float] | None, option("X Y Z")] = None
     """Look from this point in world space."""
     target: Annotated[tuple[float, float, float] | None, option("X Y Z")] = None
-    """Look from --eye to this point; by default to the middle of the subject."""
+    """Look from --eye to this point. By default, it is the middle of the subject."""
     fov: Annotated[float | None, option("DEGREES")] = None
-    """Field of view of --eye across the width of the picture in degrees; 45 by
-    default."""
+    """Horizontal field of view of --eye in degrees. The default is 45."""
     link: Annotated[str | None, tyro.conf.arg(name="at", metavar="LINK", help_behavior_hint="")] = (
         None
     )
-    """Use the camera of a link: the address of a page of `v3dg view`, in quotes."""
+    """Use the camera of a link, which is the address of a web page of `v3dg view`.
+
+    Put it in quotes.
+    """
     camera: Annotated[str | None, option("NAME")] = None
-    """Draw only this one of several cameras, by its name or its number, from 0."""
+    """Draw only this one of several cameras, given by its name or by its number from
+    0."""
     views: Annotated[int | None, option("N")] = None
     """Number of views around an object, or around the viewer inside a room; 1 by
     default, 8 for `compare`."""
@@ -82,11 +89,11 @@ class ViewOptions(CameraFile):
     """Width and height in px of pictures for which the file of the camera has no size;
     800 800 by default, and 1600 800 for pictures of all directions."""
     elevation: Annotated[float | None, option("DEGREES")] = None
-    """Elevation of the cameras around the subject above the horizon in degrees; 20 by
-    default."""
+    """Elevation of the cameras around the subject above the horizon, in degrees. The
+    default is 20."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that points up for --eye and for views around the subject; by default
-    the one in the file, or a guess."""
+    """The axis that points up for --eye and for views around the subject. By default,
+    it is the one in the file, or a guess."""
 
     @property
     def frame_size(self) -> tuple[int, int]:
@@ -128,8 +135,8 @@ class ViewOptions(CameraFile):
             check_usage(name, value is None or is_used, expected)
 
     def turntable(self) -> dict[str, object]:
-        """Return the options for views around the subject, by name; None for options
-        that were not given."""
+        """Return the options for views around the subject, by name. An option that was
+        not given is None."""
         return {"--views": self.views, "--elevation": self.elevation, "--up": self.up}
 
     def needs_up(self, own_cameras: Mapping[str, Camera] | None) -> bool:
@@ -150,8 +157,9 @@ def choose_cameras(
     own_cameras: dict[str, Camera] | None,
     views: int = 1,
 ) -> dict[str, Camera]:
-    """Return the camera of --eye or --at; else the cameras of --cameras; else those of
-    the subject; else first views of the subject (`views` of them by default)."""
+    """Return the camera of --eye or --at, or else the cameras of --cameras, or else
+    those of the subject, or else first views of the subject. By default, there are
+    `views` of the latter."""
     if options.link is not None:
         cameras = {"link": _linked(options.link, options.frame_size)}
     elif options.eye is not None:
@@ -174,7 +182,7 @@ def choose_cameras(
 
 
 def _linked(link: str, size: tuple[int, int]) -> Camera:
-    """Return the camera of a link to the viewer's page."""
+    """Return the camera of a link to the viewer's web page."""
     from v3dg.viewer.link import read_link
 
     place = read_link(link)
@@ -221,7 +229,8 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
 def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Camera]:
     """Return the first views of a subject, around an object or inside a room.
 
-    Without --views, a single view is closer to the subject than views of a turntable.
+    Without --views, there is a single view, which is closer to the subject than views
+    of a turntable.
     """
     elevation = DEFAULT_ELEVATION
     if options.elevation is not None:
@@ -238,8 +247,8 @@ def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Cam
 def choose_up(
     requested: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
-    """Return the up axis, from --up or else from `up_of`, and lines that state the
-    reason.
+    """Return the up axis, and lines that state where it comes from. It comes from --up,
+    or else from `up_of`.
 
     If the axis is unknown, a user at a terminal is asked.
     """
@@ -253,8 +262,8 @@ def choose_up(
 
 
 def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
-    """Return a line with the up axis and the reason for it; no line if the reason is
-    empty, as with --up."""
+    """Return a line with the up axis and the source of the axis. With --up, there is no
+    source and no line."""
     if not reason:
         return []
     return [f"{beside(path).name}: {axis} is up, {reason}; change it with --up"]
@@ -283,9 +292,10 @@ def ask_up(path: Path, axis: Axis) -> Axis:
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
     """Return the path of the picture for each camera. If there are several cameras,
-    each path contains the camera's name.
+    each path contains the name of the camera.
 
-    If two paths would be equal, all contain the cameras' numbers instead, from 0.
+    If two paths would be equal, all paths contain the numbers of the cameras, from 0,
+    instead.
     """
     if len(cameras) == 1:
         return [output]

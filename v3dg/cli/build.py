@@ -35,8 +35,8 @@ from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # time limit for answers of a scheduler
 _MOST_REASON = 200  # maximum number of characters of a dask error that are shown
-# The number of samples, and the number of gaussians in each, from which the up axis is
-# guessed.
+# The up axis is guessed from this number of samples. The second number is the gaussians
+# in each sample.
 _NUM_SAMPLES = 64
 _SAMPLE_SIZE = 256
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
@@ -52,29 +52,30 @@ class Build(_common.OnDevice):
     .v3dg, all files together form one asset."""
     output: Annotated[Path | None, _common.option("PATH", "-o")] = None
     """Bundle to write, or folder for the bundles of several assets. By default, each
-    bundle is written beside its asset."""
+    bundle is written next to its asset."""
     config: Literal["default", "paper"] = "default"
     """Settings of the build: the defaults, or those of the V3DG paper."""
     cluster_size: Annotated[int | None, _common.option("N")] = None
-    """Maximum number of gaussians in a cluster; by default that of --config."""
+    """Maximum number of gaussians in a cluster. The default is that of --config."""
     codec: Literal["float32", "quantized"] = "float32"
     """Encoding of gaussians: lossless, or rounded to 16 to 40 bytes (docs/format.md
     lists the errors)."""
     quality: Annotated[Quality | None, _common.option("{draft,standard,best}")] = None
     """How similar the levels are to the asset. `draft` keeps the levels as they are
-    built. `standard` also refines them together, which takes 2 s more for 45,000
-    gaussians, 5 s for 500,000 and 12 s for 2 million on an H100, in proportion for
-    more, and minutes on a CPU. `best` uses five times as many pictures for that. The
-    default is `standard` on a GPU, and `draft` otherwise."""
+    built. `standard` also refines them together. On an H100, this takes 2 s more for
+    45,000 gaussians, 5 s for 500,000 and 12 s for 2 million, and grows in proportion;
+    on a CPU, it takes minutes. `best` uses five times as many pictures. The default is
+    `standard` on a GPU, and `draft` otherwise."""
     seen_from: Annotated[SeenFrom, _common.option("{auto,outside,inside,both}")] = "auto"
-    """From where pictures of a refinement are taken; by default, the free space that
-    the asset surrounds decides. With photographs, `v3dg refine --cameras` is better."""
+    """Where pictures of a refinement are taken from. By default, this depends on the
+    free space that the asset surrounds. With photographs, `v3dg refine --cameras` is
+    better."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """The axis of the asset that points up, which the bundle stores. If it is unknown,
     a user at a terminal is asked."""
     antialiased: Annotated[Literal["yes", "no"] | None, _common.option("{yes,no}")] = None
-    """Whether the asset was trained with antialiasing; by default as declared in its
-    file, or no if it declares nothing."""
+    """Whether the asset was trained with antialiasing. The default is the declaration
+    in its file, or no if there is none."""
     seed: int = 0
     """Seed of random numbers. The same seed gives the same file, byte for byte, on the
     same kind of device and for any number of threads."""
@@ -88,8 +89,8 @@ class Build(_common.OnDevice):
     """Replace existing bundles of several assets. The bundle of a single asset is
     always replaced."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
-    """Host memory for the build, such as 8GiB; by default half of the free memory. An
-    asset that does not fit is sorted on the disk of the output."""
+    """Host memory for the build, such as 8GiB. The default is half of the free memory.
+    An asset that does not fit is sorted on the disk of the output."""
     scheduler: Annotated[str | None, _common.option("ADDRESS")] = None
     """Build on the workers of the dask scheduler at this address, such as
     tcp://host:8786. The workers need access to the folder of the output. Needs the
@@ -114,8 +115,8 @@ def run(options: Build) -> None:
 
 
 def _asked_up(path: Path) -> Axis | None:
-    """Return the up axis of an asset that a user at a terminal enters; None if there is
-    no terminal, or if the format or the gaussians determine the axis."""
+    """Ask a user at a terminal for the up axis of an asset. Return None if there is no
+    terminal, or if the format or the gaussians determine the axis."""
     if not is_at_terminal():
         return None
     _common.require_file(path, *SUFFIXES)
@@ -134,13 +135,13 @@ def _asked_up(path: Path) -> Axis | None:
 
 @contextmanager
 def _executor_at(address: str | None) -> Iterator[Executor | None]:
-    """Return an executor with the workers of a dask scheduler; None without an
-    address."""
+    """Yield an executor with the workers of a dask scheduler. Without an address,
+    yield None."""
     if address is None:
         yield None
         return
     distributed = _extras.load("distributed")
-    # dask must not log errors, because the command reports them.
+    # dask must not log errors, because the command reports them itself.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     _greet(address)
@@ -153,7 +154,7 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
             f"{expected} that answers, got none ({reason}); check the address"
         ) from None
     except Exception as error:
-        # Servers of another kind or version may cause an error of any type.
+        # Servers of another kind or version may cause errors of any type.
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:_MOST_REASON]
         raise RuntimeError(
             f"{expected}, got another server ({reason}); check the address"
@@ -163,8 +164,8 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
 
 
 def _greet(address: str) -> None:
-    """Send a greeting to a scheduler; raise RuntimeError unless it answers in time in
-    the protocol of dask.
+    """Send a greeting to a scheduler. Raise RuntimeError unless it answers in time in
+    dask's protocol.
 
     A dask client would wait forever for a server that accepts connections but never
     answers.
@@ -197,7 +198,7 @@ def _greet(address: str) -> None:
             f"{expected} without TLS, got one that needs it ({error}); configure dask's security"
         ) from None
     except Exception:
-        # dask raises this error for another protocol, because it reads the first eight
+        # For another protocol, dask raises this error, because it reads the first eight
         # bytes as a size.
         advice = "pass the address that `dask scheduler` prints"
         raise RuntimeError(
@@ -216,7 +217,7 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
             _common.tell(f"[{len(results) + 1}/{len(outputs)}] {shown(asset)}")
         try:
             results.append(_build(options, assets[asset], output, executor))
-        except SchedulerError as error:  # all further assets would fail in the same way
+        except SchedulerError as error:  # all other assets would fail in the same way
             raise SchedulerError(f"{error}; {_progress_text(results, outputs)}") from None
         except _common.FAILURES as error:
             failure = cleaned(_common.failure_text(error))
@@ -267,8 +268,8 @@ def _print_many(options: Build, results: list[JsonObject], seconds: float) -> No
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
-    """Return the files of each asset, by the path that identifies it: a file, or a
-    folder that is one asset or contains a trainer's run."""
+    """Return the files of each asset, by the path that identifies the asset. The path
+    is a file, or a folder that is one asset or contains a trainer's run."""
     assets: dict[Path, list[Path]] = {}
     for path in paths:
         if not path.is_dir() or asset_file(path) != path:
@@ -314,8 +315,8 @@ def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
 
 
 def _check_new(outputs: Sequence[Path]) -> None:
-    """Raise UsageError if bundles whose names the user has not given would be
-    replaced."""
+    """Raise UsageError if bundles would be replaced whose names the user has not
+    given."""
     existing = [output for output in outputs if output.exists()]
     if existing:
         ending = ""
@@ -328,7 +329,7 @@ def _check_new(outputs: Sequence[Path]) -> None:
 def _build(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> JsonObject:
-    """Build and write one bundle; return its description as a JSON object."""
+    """Build and write one bundle. Return its description as a JSON object."""
     _check_files(paths, output)
     start = time.perf_counter()
     with _resume_advised(output):
@@ -377,8 +378,8 @@ def _check_files(paths: Sequence[Path], output: Path) -> None:
 
 
 def _sample_of(bundle: Bundle) -> Gaussians:
-    """Return gaussians of some clusters of level 0; all of a bundle without
-    clusters."""
+    """Return the gaussians of some clusters of level 0. If the bundle has no clusters,
+    return all of its gaussians."""
     if not bundle.num_levels:
         return bundle.gaussians
     clusters = bundle.level_range(0)
@@ -455,7 +456,7 @@ def _config_of(options: Build) -> BuildConfig:
 
 @contextmanager
 def _resume_advised(output: Path) -> Iterator[None]:
-    """Add to errors and interrupts of a build how it can be continued."""
+    """Add advice about continuing the build to its errors and interrupts."""
     try:
         yield
     except KeyboardInterrupt:
@@ -463,15 +464,15 @@ def _resume_advised(output: Path) -> Iterator[None]:
     except SchedulerError as error:
         raise SchedulerError(f"{error}{_resume_advice(output)}") from None
     except OSError as error:  # for example, the disk is full
-        if error.errno is None:  # an error about a URL, whose text is complete
+        if error.errno is None:  # an error about a URL already has a complete text
             raise type(error)(f"{error}{_resume_advice(output)}") from None
         text = f"{error.strerror}{_resume_advice(output)}"
         raise OSError(error.errno, text, error.filename) from None
 
 
 def _resume_advice(output: Path) -> str:
-    """Return the end of the message about an unfinished build: the file from which it
-    can be continued. Empty if there is no such file."""
+    """Return the end of the message about an unfinished build, which names the file to
+    continue from. If there is no such file, it is empty."""
     levels = levels_path(output)
     if levels.exists():
         return f"; `--resume` continues from {levels}"
@@ -486,8 +487,8 @@ def _quality_of(options: Build, bundle: Bundle) -> Quality:
 
 
 def _estimated_seconds(options: Build, bundle: Bundle, *, is_built: bool) -> float | None:
-    """Return the approximate time of a refinement of a new draft on this CPU; None for
-    other bundles, on a GPU, and where there is too little memory to measure it."""
+    """Return the approximate time for refining a new draft on this CPU. Return None for
+    other bundles, on a GPU, and if there is too little memory to measure it."""
     is_draft = is_built and bundle.num_levels > 1 and "refined" not in bundle.config
     device = _device.resolve(options.device)
     if not is_draft or device.is_cuda or options.quiet or options.quality == "draft":

@@ -24,11 +24,11 @@ from v3dg.metrics import FLIP_MISSING, MIN_TRANSMITTANCE, draw_truth, error_imag
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
-# With at least this number of views, measuring in other processes is faster, in spite
-# of the time to start them.
+# From this number of views on, measuring in other processes is faster, in spite of the
+# time to start them.
 _ENOUGH_TO_SHARE = 6
 
-# Smaller pictures are enlarged to about this width in px when they are shown side by
+# Smaller pictures are enlarged to about this width, in px, when they are shown side by
 # side.
 _LEAST_WIDTH = 300
 
@@ -51,17 +51,17 @@ class Compare(_common.Cut, _common.OnDevice):
 
     reference: tyro.conf.Positional[Path]
     """An asset, a bundle (.v3dg) or a scene (.json), which is drawn with all its
-    gaussians; or a picture (.png, .jpg)."""
+    gaussians, or a picture (.png, .jpg)."""
     test: tyro.conf.Positional[Path]
-    """The subject that is compared with the reference, which is drawn with a tolerance;
-    or a picture of the same size as the reference."""
+    """The subject that is compared with the reference. It is drawn with a tolerance. If
+    the reference is a picture, this must be a picture of the same size."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
     """Picture to write, .png or .jpg. It shows the reference, the test and, if FLIP is
     installed, the map of FLIP."""
     pictures: Literal["worst", "all"] = "worst"
     """Write a picture of the view with the largest difference, or of every view."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Draw the reference this many times larger and average its pixels; with 2,
+    """Draw the reference this many times larger, and average its pixels. With 2,
     aliasing does not count as detail."""
     view: Views = field(default_factory=ViewOptions)
 
@@ -72,7 +72,7 @@ class _Pair(NamedTuple):
     name: str
     reference: Picture
     test: Picture
-    gaussians: int | None = None  # gaussians in the cut of the test
+    gaussians: int | None = None  # number of gaussians in the cut of the test
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def run(options: Compare) -> None:
 
 
 def _measure(options: Compare, pairs: _Pairs, output: Path) -> tuple[list[JsonObject], JsonObject]:
-    """Measure all pairs and write their pictures; return the rows of the result, and
+    """Measure all pairs, and write their pictures. Return the rows of the result, and
     the row with the largest difference."""
     paths = [output] * len(pairs.names)
     if options.pictures == "all":
@@ -206,7 +206,7 @@ def _draw(options: Compare) -> _Pairs:
                 tolerance=options.tolerance,
                 budget=options.budget,
                 device=device,
-                # the same value as for the reference, so that only gaussians differ
+                # the same value as for the reference, so that only the gaussians differ
                 min_transmittance=MIN_TRANSMITTANCE,
             )
             yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)
@@ -219,8 +219,8 @@ def _errors(pair: _Pair) -> dict[str, float | None]:
 
 
 def _difference(row: JsonObject) -> float:
-    """Return the key by which views are sorted: FLIP or, if it is missing, the negative
-    PSNR."""
+    """Return the key by which views are sorted. It is FLIP or, if FLIP is missing, the
+    negative PSNR."""
     if row["flip"] is not None:
         return float(row["flip"])
     if row["psnr"] is not None:

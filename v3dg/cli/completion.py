@@ -16,8 +16,8 @@ _Shell: TypeAlias = Literal["bash", "zsh", "fish"]
 # The completions of a command, in tyro's format: nested dicts and lists.
 _Spec: TypeAlias = dict[str, object]
 
-# Replacements in tyro's scripts, so that file names are completed if neither a command
-# nor an option matches.
+# Replacements in tyro's scripts. With them, file names are completed if neither a
+# command nor an option matches.
 _OR_FILES = {
     "bash": ("complete -F", "complete -o default -F"),
     "zsh": ('[[ "$completions" ==', '[[ -z "$completions" || "$completions" =='),
@@ -44,7 +44,8 @@ def run(options: Completion) -> None:
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         parse(["--tyro-write-completion", options.shell, "-"])
     text = _plain(script.getvalue(), options.shell).replace(*_OR_FILES[options.shell])
-    # An empty completion must not count as a match, so that file names are completed.
+    # An empty completion must not count as a match. Otherwise, file names would not be
+    # completed.
     text = text.replace(_BASH_MATCH, f'[[ -z "$completion" ]] || {_BASH_MATCH}')
     if options.json:
         text = json.dumps({"shell": options.shell, "script": text})

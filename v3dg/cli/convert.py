@@ -35,8 +35,8 @@ class ConvertViews(ViewOptions):
     """Options for the cameras of cuts, and for the up axis of the input."""
 
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """The axis of the input that points up; gaussians are rotated so that it becomes
-    -y. By default it is the axis that `v3dg info` shows, and only outputs with defined
+    """The axis of the input that points up. Gaussians are rotated so that it becomes
+    -y. By default, it is the axis that `v3dg info` shows, and only outputs with defined
     axes (.spz, .glb and .usd) are rotated."""
 
 
@@ -52,19 +52,19 @@ class Convert(_common.Cut, _common.Common):
     """An asset in any readable format (docs/formats.md), a bundle (.v3dg) or a scene
     (.json)."""
     output: tyro.conf.Positional[Path]
-    """File to write: .ply, .compressed.ply, .spz, .sog, .glb or .usd; or .v3dg, if the
-    subject is a bundle, with all its levels."""
+    """File to write: .ply, .compressed.ply, .spz, .sog, .glb or .usd. If the subject is
+    a bundle, it may also be .v3dg, which has all levels."""
     codec: Annotated[
         Literal["float32", "quantized"] | None, _common.option("{float32,quantized}")
     ] = None
-    """Codec of a .v3dg output, see `v3dg build`; by default that of the input."""
+    """Codec of a .v3dg output; see `v3dg build`. The default is that of the input."""
     level: Annotated[int | None, _common.option("N")] = None
     """Write this level of a bundle. By default it is 0, the asset itself, unless other
     options select a cut."""
     outside: Literal["drop", "keep"] = "drop"
     """Whether to drop or keep the part of the cut that the camera does not see."""
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
-    """Version of a .spz output; 3 by default."""
+    """Version of a .spz output. The default is 3."""
     moves: Moves = field(default_factory=MoveOptions)
     edits: Edits = field(default_factory=EditOptions)
     faults: Faults = field(default_factory=FaultOptions)
@@ -93,7 +93,7 @@ def run(options: Convert) -> None:
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
     with warnings.catch_warnings():
-        # The result reports these warnings.
+        # These warnings are part of the result.
         warnings.simplefilter("ignore", AssetWarning)
         subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
     output = options.output
@@ -124,8 +124,8 @@ def run(options: Convert) -> None:
 def _written(
     options: Convert, subject: Subject, part: _Part, editor: Editor, notes: list[str]
 ) -> _Part:
-    """Join, move, trim, check and write a part. Append lines to `notes` about rotations
-    and losses; return the written part."""
+    """Join, move, trim, check and write a part. Append lines about rotations and losses
+    to `notes`. Return the written part."""
     output = options.output
     name = shown(options.subject)
     if isinstance(subject, Gaussians):
@@ -182,8 +182,8 @@ def _is_bundle(path: Path) -> bool:
 
 
 def _check_output(options: Convert) -> None:
-    """Raise an error for an output that cannot be written, and for options that do not
-    apply to its format."""
+    """Raise an error if the output cannot be written, or if options do not apply to its
+    format."""
     output = options.output
     name = output.name.lower()
     suffixes = (*WRITE_SUFFIXES, ".v3dg")
@@ -264,7 +264,7 @@ def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camer
         cull=options.outside == "drop",
         device=CPU,
     )
-    # Only pages with clusters of the cut are read.
+    # Only read the pages that have clusters of the cut.
     if isinstance(subject, Bundle) and len(selection):
         gaussians = Gaussians.concatenate(
             [subject.cluster_gaussians(int(c)) for c in selection.cluster_ids]

@@ -18,13 +18,13 @@ from v3dg._version import __version__
 from v3dg.cli._common import Common, print_result
 from v3dg.render.webgpu.gpu import Gpu
 
-_PATIENCE_S = 20  # time limit in seconds for the answer of a program
+_PATIENCE_S = 20  # time limit, in seconds, for the answer of a program
 
 
 @dataclass
 class Doctor(Common):
-    """List the software and hardware that v3dg can use. For missing parts, print their
-    purpose and how to get them."""
+    """List the software and hardware that v3dg can use. For each missing part, print
+    what it is for and how to get it."""
 
 
 def run(options: Doctor) -> None:
@@ -47,8 +47,8 @@ class _Finding(NamedTuple):
     """A part of the machine's software or hardware that v3dg can use."""
 
     part: str
-    version: str | None  # a description of the installed part; None if it is missing
-    advice: str  # the purpose of the part, and how to get it
+    version: str | None  # a description of the installed part, or None if it is missing
+    advice: str  # what the part is for, and how to get it
 
 
 def _findings() -> Iterator[_Finding]:
@@ -102,7 +102,10 @@ def _webgpu() -> _Finding:
 
 
 def _answer(*command: str, line: int = 0) -> str | None:
-    """Return a line of a program's output; None if the program is missing or fails."""
+    """Return a line of a program's output.
+
+    Return None if the program is missing or fails.
+    """
     with contextlib.suppress(OSError, subprocess.SubprocessError, IndexError):
         process = subprocess.run(
             command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True

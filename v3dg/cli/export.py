@@ -26,25 +26,25 @@ class Export(_common.Common):
     """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD
     (docs/formats.md, docs/web_page.md).
 
-    The folder may be new, empty, or contain an earlier export. Only unchanged files
-    that are listed in its v3dg-export.json are replaced or removed. The inputs must not
-    be in this folder.
+    The folder may be new or empty, or contain an earlier export. Only unchanged files
+    that its v3dg-export.json lists are replaced or removed. The inputs must not be in
+    this folder.
     """
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg), or an OpenUSD file with instances."""
     output: Annotated[Path | None, _common.option("FOLDER", "-o")] = None
-    """Folder to write, which is created if needed; by default the name of the subject
-    followed by _web. A name that ends in .usd, .usda or .usdc is a file."""
+    """Folder to write. It is created if needed. By default, its name is that of the
+    subject followed by _web. A name that ends in .usd, .usda or .usdc is a file."""
     to: Literal["sog", "tiles", "v3dg"] = "sog"
     """Streamed SOG for PlayCanvas and SuperSplat, 3D Tiles for CesiumJS, or bundles for
-    our own page, which needs a browser with WebGPU."""
+    the web page of v3dg, which needs a browser with WebGPU."""
     chunk: int = export.DEFAULT_CHUNK
-    """Largest number of gaussians of an asset in a chunk of streamed SOG. Viewers
+    """Maximum number of gaussians of an asset in a chunk of streamed SOG. Viewers
     choose a level for each chunk."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that points up; by default the one in the file, or a guess from the
-    gaussians or the cameras."""
+    """The axis that points up. By default, it is the one in the file, or a guess from
+    the gaussians or the cameras."""
     overwrite: _common.Flag = False
     """Write to any folder, and replace files with the same names. No other file is
     removed, and no folder or link is replaced."""

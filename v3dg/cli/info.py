@@ -27,7 +27,7 @@ from v3dg.upright import direction_of, up_of
 # A description as a JSON object, and as lines of text.
 _Description: TypeAlias = tuple[JsonObject, list[str]]
 
-# Maximum number of listed cameras, so that the other lines stay on the screen.
+# Maximum number of cameras that are listed, so that the other lines stay on the screen.
 _MOST_SHOWN = 20
 
 
@@ -60,8 +60,8 @@ def run(options: Info) -> None:
 
 
 def _first_view(subject: Subject, up: Axis) -> tuple[JsonObject | None, str]:
-    """Return the camera that shows a subject by default, in `v3dg render` and in the
-    viewer, too; None if pages that it needs are damaged."""
+    """Return the camera that shows a subject by default, as in `v3dg render` and in the
+    viewer. Return None if the pages that it needs are damaged."""
     try:
         framing = frame_subject(subject)
     except (OSError, ValueError) as error:
@@ -153,8 +153,8 @@ def _spread_lines(spread: Mapping[str, Sequence[float]]) -> list[str]:
 
 
 def _box(means: Array) -> list[list[float]]:
-    """Return the minimum and the maximum corner of positions; empty if there are
-    none."""
+    """Return the minimum and the maximum corner of positions. If there are no
+    positions, return an empty list."""
     if not len(means):
         return []
     return [means.min(axis=0).tolist(), means.max(axis=0).tolist()]
@@ -259,8 +259,8 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
 
 
 def _settings(config: JsonObject, prefix: str = "") -> Iterator[tuple[str, Json]]:
-    """Yield the names and values in a bundle's config. Names in nested objects are
-    prefixed, except those of the build's settings."""
+    """Yield the names and values in a bundle's config. Names in nested objects get a
+    prefix, except for those of the build's settings."""
     for name, value in config.items():
         if isinstance(value, dict):
             nested_prefix = f"{name} "

@@ -57,18 +57,18 @@ class Render(Cut, Pooled, OnAnyDevice):
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
-    """Picture (.png or .jpg) or film (.mp4) to write. The names of several pictures
-    also contain a number or the name of the camera. By default, the picture is named
-    after the subject."""
+    """Picture (.png or .jpg) or film (.mp4) to write. If there are several pictures,
+    their names also contain a number or the name of the camera. By default, the picture
+    is named after the subject."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except for bundles with fewer levels."""
     fade: Annotated[float | None, option("FACTOR")] = None
     """Blend two levels within this factor of the tolerance, and draw level 0 with a
-    low-pass filter, so that a film neither pops nor flickers. The default is 1.02 for
-    films and for several views around the subject, otherwise 1, which means no
+    low-pass filter. A film then neither pops nor flickers. The default is 1.02 for
+    films and for several views around the subject. Otherwise it is 1, which means no
     blending."""
     color_by: ColorBy = "appearance"
-    """The property that colours represent."""
+    """What the colours show."""
     background: Annotated[
         tuple[float, float, float] | str, tyro.conf.arg(metavar="R G B|COLOR|none")
     ] = (0.0, 0.0, 0.0)
@@ -83,8 +83,8 @@ class Render(Cut, Pooled, OnAnyDevice):
     fps: Annotated[int, tyro.conf.arg(metavar="N")] = 30
     """Pictures per second of a film."""
     seconds: Annotated[float | None, option("S")] = None
-    """Duration of a film in seconds, along a smooth curve through the cameras at
-    constant speed. By default, a film has one picture for each camera."""
+    """Duration of a film in seconds. The camera moves at constant speed along a smooth
+    curve through the cameras. By default, a film has one picture for each camera."""
     view: Views = field(default_factory=ViewOptions)
 
     @property
@@ -103,10 +103,10 @@ class Render(Cut, Pooled, OnAnyDevice):
 
 @dataclass(frozen=True)
 class _Style:
-    """Properties that are common to all pictures of a command.
+    """Properties that all pictures of a command share.
 
     Attributes:
-        background: The colour behind the gaussians; None for transparent pictures.
+        background: The colour behind the gaussians, or None for transparent pictures.
         up: The axis that points up, for panoramas.
     """
 
@@ -185,8 +185,8 @@ def _print(options: Render, pictures: list[JsonObject], notes: list[str], output
 
 
 def _checked_output(options: Render, background: Color | None) -> Path:
-    """Return the path of the output. Before anything is read, raise an error if it
-    cannot be written, or if options do not apply to it."""
+    """Return the path of the output. Raise an error if it cannot be written, or if
+    options do not apply to it. Nothing has been read by then."""
     output = options.output or Path(f"{subject_name(options.subject)}.png")
     check_output(output, options.subject)
     check_usage("--fps", 1 <= options.fps <= 1000, f"a number from 1 to 1000, got {options.fps}")
@@ -237,7 +237,7 @@ def _check_sizes(options: Render, cameras: Mapping[str, Camera]) -> None:
 
 def _flight(cameras: Mapping[str, Camera], seconds: float, fps: int) -> dict[str, Camera]:
     """Return the cameras of a film along a smooth curve through these cameras, which
-    all have the same size."""
+    must all have the same size."""
     from v3dg.viewer.path import CameraPath
     from v3dg.viewer.view import View
 
@@ -251,7 +251,7 @@ def _flight(cameras: Mapping[str, Camera], seconds: float, fps: int) -> dict[str
 
 def _lines_of_faults(path: Path, subject: Subject) -> list[str]:
     """Return a line about the number of gaussians with invalid values, which are not
-    drawn; no line if there are none."""
+    drawn. If there are none, there is no line."""
     if not isinstance(subject, Gaussians):
         return []
     findings = examine(subject)
@@ -306,8 +306,8 @@ def _drawn(
 
 
 def _costs(image: Image, faces: list[RenderedImage]) -> JsonObject:
-    """Return the costs of a picture. For a panorama of pinholes, they are the sums over
-    its sides."""
+    """Return the costs of a picture. For a panorama from pinhole pictures, they are
+    sums over its sides."""
     if isinstance(image, RayImage):
         return {"gaussians_selected": image.gaussians}
     stats = [face.stats for face in faces]

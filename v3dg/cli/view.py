@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from v3dg.viewer.server import Site
 
 # Time between two checks for a signal. An endless wait could miss a signal that arrives
-# just before it.
+# just before it begins.
 _SECONDS = 0.1
 
 
@@ -54,19 +54,19 @@ class View(CameraFile, Cut, OnPool):
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     host: str = "127.0.0.1"
-    """Address on which the server listens. By default, only this machine can connect;
-    with 0.0.0.0, everybody who knows the URL can connect."""
+    """Address on which the server listens. By default, only this machine can connect.
+    With 0.0.0.0, everybody who knows the URL can connect."""
     port: int = 8080
-    """Port of the server. If it is taken, the next free port is used."""
+    """Port of the server. If it is in use, the next free port is used."""
     no_browser: Flag = False
-    """Do not open a browser. A browser is also not opened over ssh, without a display,
+    """Do not open a browser. No browser is opened over ssh either, without a display,
     or if other machines can connect."""
     background: Annotated[Color | str, tyro.conf.arg(metavar="R G B|COLOR")] = (0.0, 0.0, 0.0)
     """Initial background: red, green and blue from 0 to 1, or a colour such as white or
     #87ceeb."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that points up at first; by default the one in the file, or a guess from
-    the gaussians or the cameras."""
+    """The axis that points up initially. By default, it is the one in the file, or a
+    guess from the gaussians or the cameras."""
 
 
 def run(options: View) -> None:
@@ -86,8 +86,8 @@ def run(options: View) -> None:
     if up is None:
         up, reason = up_of(subject, cameras)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
-    # Imported early, because the import takes long. If it fails, the site reports the
-    # error.
+    # Import it early, because this takes long. If the import fails, the site reports
+    # the error.
     with contextlib.suppress(ImportError):
         importlib.import_module("v3dg.viewer.tab")
     with _interrupts() as interrupts:
@@ -130,14 +130,14 @@ def _background_of(options: View) -> Color:
 
 
 def _folder_of(subject: Path) -> Path | None:
-    """Return the folder of a local file; None for a URL."""
+    """Return the folder of a local file, or None for a URL."""
     if is_url(subject):
         return None
     return subject.absolute().parent
 
 
 def _tolerance_of(options: View) -> float:
-    """Return the initial tolerance; raise UsageError or ValueError if it is not finite,
+    """Return the initial tolerance. Raise UsageError or ValueError if it is not finite,
     or if the budget is invalid."""
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
@@ -173,8 +173,8 @@ def _has_browser() -> bool:
 
 
 def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
-    """Return the paths of photographs by the names of cameras. They are searched beside
-    the file of the cameras and in folders `images` near it."""
+    """Return the paths of photographs by the names of cameras. The photographs are
+    searched for next to the file of the cameras, and in folders `images` near it."""
     if cameras is None:
         return {}
     folder = cameras
@@ -193,12 +193,12 @@ def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Yield a list to which the numbers of received signals (Ctrl-C and SIGTERM) are
-    appended.
+    """Yield a list. The numbers of received signals (Ctrl-C and SIGTERM) are appended
+    to it.
 
-    Signals raise no exceptions, which could interrupt the start of a thread. If a
-    signal was received, further ones are ignored at the end, because the process ends.
-    The handler must not take a lock, because its thread may already hold it.
+    Signals raise no exceptions, which could interrupt the start of a thread. After a
+    signal, later ones are ignored at the end, because the process ends anyway. The
+    handler must not take a lock, because its thread may already hold it.
     """
     received: list[int] = []
     numbers = (*SIGNALS, signal.SIGTERM)

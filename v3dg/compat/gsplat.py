@@ -46,7 +46,7 @@ _LOCATED = (
     "is_seen",
 )
 _FARTHEST = 1e10
-# Arguments that only change how gsplat computes, and not its results.
+# Arguments that only change how gsplat computes, but not its results.
 _IGNORED = {"tile_size", "channel_chunk", "segmented"}
 # Arguments of gsplat that are not supported, with advice.
 _UNSUPPORTED = {
@@ -90,19 +90,20 @@ def rasterization(
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
     """Draw N gaussians for C cameras, like the function with this name in gsplat 1.5.
 
-    All cameras are drawn together. The tensors must be float32 or, on the CPU, all
-    float64. As in gsplat, all tensors may have the same batch dimensions in front, for
-    several sets of N gaussians with C cameras each; so have the results.
+    All cameras are drawn together. The tensors must be float32 or, on the CPU, may all
+    be float64. As in gsplat, all tensors may have the same additional batch dimensions
+    in front, for several sets of N gaussians with C cameras each. The results then have
+    them, too.
 
     Args:
         means: (N, 3) centres in world space.
-        quats: (N, 4) rotations w, x, y, z; they need not be normalised.
-        scales: (N, 3) standard deviations; not logarithms.
-        opacities: (N,) in [0, 1]; not logits.
-        colors: (N, 3) or (C, N, 3) colours; with `sh_degree` (N, K, 3) or (C, N, K, 3)
+        quats: (N, 4) rotations w, x, y, z, which need not be normalised.
+        scales: (N, 3) standard deviations (not logarithms).
+        opacities: (N,) in [0, 1] (not logits).
+        colors: (N, 3) or (C, N, 3) colours. With `sh_degree`, (N, K, 3) or (C, N, K, 3)
             coefficients.
-        viewmats: (C, 4, 4) world to camera. Their gradient is that of matrices with
-            independent elements, so that it may be passed on to any parameters of
+        viewmats: (C, 4, 4) from world to camera. Their elements are independent
+            variables of the gradient, so it can be propagated to any parameters of
             poses. The last row has no gradient.
         Ks: (C, 3, 3) intrinsics in px, without gradient.
         width: Width of the pictures in px.
@@ -111,18 +112,19 @@ def rasterization(
         far_plane: Gaussians with a larger depth are not drawn.
         radius_clip: Gaussians with a radius of at most this many px are not drawn.
         eps2d: Variance of the low-pass filter in px².
-        sh_degree: Degree of the coefficients in `colors`; None for colours.
+        sh_degree: Degree of the coefficients in `colors`. None means that they are
+            colours.
         packed: Whether the dict contains only visible pairs of a camera and a gaussian.
-        backgrounds: (C, 3) colours; black if None.
-        render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", where D is depth and ED
-            expected depth.
+        backgrounds: (C, 3) colours. None means black.
+        render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", where D is accumulated depth
+            and ED expected depth.
         absgrad: Whether to set `.absgrad` of `means2d` to the sum of absolute
             gradients.
         rasterize_mode: "classic", or "antialiased" to compensate opacities for the
             filter.
         options: The other arguments of gsplat. `tile_size`, `channel_chunk` and
-            `segmented` only affect how gsplat computes and are ignored. All others are
-            not supported and must have a value that turns them off.
+            `segmented` only affect how gsplat computes, so they are ignored. All others
+            are not supported, and must have a value that turns them off.
 
     Returns:
         Pictures (C, H, W, D), alphas (C, H, W, 1), and a dict: `means2d`, `depths`,
@@ -133,7 +135,7 @@ def rasterization(
 
     Raises:
         ValueError: A shape or a value is wrong, or is not supported.
-        TypeError: An argument is not a tensor, or not an argument of gsplat.
+        TypeError: An argument is not a tensor, or gsplat does not have it.
     """
     _check_unsupported(options)
     look = _Look(
@@ -155,7 +157,7 @@ def rasterization(
 
 
 def _check_tensors(tensors: Mapping[str, torch.Tensor]) -> None:
-    """Raise TypeError unless all arguments are tensors; raise an error if their device
+    """Raise TypeError unless all arguments are tensors. Raise an error if their device
     cannot draw them."""
     for name, value in tensors.items():
         if not hasattr(value, "requires_grad"):
@@ -212,8 +214,8 @@ class _Look:
 
     @property
     def depth(self) -> str:
-        """The kind of depth: "D" for accumulated depth, "ED" for expected depth, or
-        ""."""
+        """The kind of depth: "D" for accumulated depth, "ED" for expected depth, or ""
+        for none."""
         return self.render_mode.removeprefix("RGB").lstrip("+")
 
 
@@ -234,7 +236,7 @@ def _check_unsupported(options: dict[str, object]) -> None:
 class _Sizes:
     """The numbers of sets, cameras and gaussians."""
 
-    batch: tuple[int, ...]  # batch dimensions; the product is the number of sets
+    batch: tuple[int, ...]  # batch dimensions; their product is the number of sets
     num_cameras: int
     num_gaussians: int
 
@@ -253,8 +255,8 @@ def _sizes(
     viewmats: torch.Tensor,
     Ks: torch.Tensor,
 ) -> _Sizes:
-    """Return the sizes that the tensors have; raise an error if they are no tensors, or
-    do not fit together. The shapes of one set are checked later."""
+    """Return the sizes of the tensors. Raise an error if an argument is not a tensor,
+    or if the sizes do not match. The shapes inside one set are checked later."""
     _check_tensors({**shape, "colors": colors, "viewmats": viewmats, "Ks": Ks})
     means = shape["means"]
     batch = tuple(means.shape[:-2])
@@ -300,8 +302,8 @@ def _views(
 def _sh_of_views(
     look: _Look, colors: torch.Tensor, sizes: _Sizes, means: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Return the SH coefficients (N, K, 3) for the core: one array for all cameras, one
-    for each set, or one for each camera."""
+    """Return the SH coefficients (N, K, 3) for the core. There is one array for all
+    cameras, one for each set, or one for each camera."""
     count = sizes.num_gaussians
     if not look.has_color:
         return [means.new_zeros(count, 1, 3)]
@@ -343,8 +345,8 @@ def _draw(
     colors: torch.Tensor,
     size: tuple[int, int],
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
-    """Return pictures, alphas and gsplat's dict. ``shape`` is means, quats, scales and
-    opacities; ``size`` is width and height in px."""
+    """Return pictures, alphas and gsplat's dict. ``shape`` has means, quats, scales and
+    opacities. ``size`` has width and height in px."""
     num_batch = len(sizes.batch)
     by_set = [_of_sets(tensor, num_batch) for tensor in shape]
     *geometry, opacities = by_set
@@ -426,9 +428,9 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
     """Return the operation that projects gaussians onto the images. Its results are the
     tensors in the dict.
 
-    The gradient of a picture flows to the gaussians directly, not through `means2d`,
-    which only reports it to training strategies. A loss on `means2d` or `depths` would
-    therefore have no effect, so it raises an error.
+    The gradient of a picture flows to the gaussians directly. It does not flow through
+    `means2d`, which only reports it to training strategies. Therefore a loss on
+    `means2d` or `depths` would have no effect, so it raises an error.
     """
     import torch
 
@@ -477,9 +479,10 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
 def _located(
     look: _Look, views: Views, sizes: _Sizes, shape: Sequence[torch.Tensor]
 ) -> tuple[list[torch.Tensor], list[torch.Tensor | None]]:
-    """Return centres, depths, conics, opacities and radii; then, where needed, the
-    sets, cameras and gaussians of the visible pairs, and (V, N) whether each gaussian
-    is visible. `shape` is the means of all sets, then their quats, and so on."""
+    """Return centres, depths, conics, opacities and radii. If needed, they are followed
+    by the sets, cameras and gaussians of the visible pairs, and by (V, N) whether each
+    gaussian is visible. `shape` has the means of all sets, then their quats, and so
+    on."""
     import torch
 
     num_sets = sizes.num_sets

@@ -21,7 +21,10 @@ def folders_above(name: str) -> list[str]:
 
 @contextmanager
 def _opened_below(descriptor: int, folders: list[str]) -> Iterator[int]:
-    """Yield a descriptor of a folder below an open one, opened part by part."""
+    """Yield a descriptor of a folder below an open one.
+
+    The folders on the way are opened one by one.
+    """
     inner = os.dup(descriptor)
     try:
         for folder in folders:
@@ -35,8 +38,8 @@ def _opened_below(descriptor: int, folders: list[str]) -> Iterator[int]:
 
 class Folder(AbstractContextManager["Folder"]):
     """An open folder. All names are relative to this folder and use `/` as separator.
-    No link is followed. Where the system cannot open folders, links are refused when a
-    name is used, which does not protect from programs that replace a folder meanwhile.
+    No link is followed. If the system cannot open folders, links are refused when a
+    name is used; this does not protect from programs that replace a folder in between.
 
     If a folder in a name is a link or a file, OSError is raised. Errors contain
     `display_path` instead of the real path.
@@ -56,7 +59,8 @@ class Folder(AbstractContextManager["Folder"]):
     @contextmanager
     def _folder_of(self, name: str) -> Iterator[tuple[int | None, str]]:
         """Yield a descriptor of the folder that contains a file or folder, and the last
-        part of the name; without descriptors of folders, None and the whole path."""
+        part of the name. Without descriptors of folders, yield None and the whole
+        path."""
         *folders, last = name.split("/")
         try:
             if self._descriptor is None:
@@ -85,14 +89,14 @@ class Folder(AbstractContextManager["Folder"]):
         return os.listdir(self._descriptor)
 
     def make_private_folder(self, name: str) -> None:
-        """Create a folder that other users cannot read; raise FileExistsError if the
+        """Create a folder that other users cannot read. Raise FileExistsError if the
         name exists."""
         with self._folder_of(name) as (folder, last):
             os.mkdir(last, 0o700, dir_fd=folder)
 
     def status(self, name: str) -> os.stat_result | None:
-        """Return the status of a file, a folder or a link; None if the name does not
-        exist."""
+        """Return the status of a file, a folder or a link. Return None if the name does
+        not exist."""
         try:
             with self._folder_of(name) as (folder, last):
                 return os.stat(last, dir_fd=folder, follow_symlinks=False)
@@ -100,7 +104,7 @@ class Folder(AbstractContextManager["Folder"]):
             return None
 
     def open_file(self, name: str) -> int:
-        """Open a file for reading and return its descriptor; raise OSError for a link,
+        """Open a file for reading, and return its descriptor. Raise OSError for a link,
         and ValueError for a folder or a device."""
         with self._folder_of(name) as (folder, last):
             if folder is None and os.path.islink(last):
@@ -119,8 +123,8 @@ class Folder(AbstractContextManager["Folder"]):
             os.mkdir(last, dir_fd=folder)
 
     def move(self, source: str, target: str) -> None:
-        """Rename a file, creating the folders of its new name; raise FileExistsError if
-        the new name exists."""
+        """Rename a file, and create the folders of its new name. Raise FileExistsError
+        if the new name exists."""
         for parent in folders_above(target):
             self.make_folder(parent)
         with (
@@ -137,6 +141,6 @@ class Folder(AbstractContextManager["Folder"]):
             os.unlink(last, dir_fd=folder)
 
     def remove_empty_folder(self, name: str) -> None:
-        """Remove an empty folder; do nothing if it is missing or not empty."""
+        """Remove an empty folder. Do nothing if it is missing or not empty."""
         with suppress(OSError), self._folder_of(name) as (folder, last):
             os.rmdir(last, dir_fd=folder)

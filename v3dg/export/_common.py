@@ -29,11 +29,11 @@ _MIN_OPACITY = float(np.float32(_core.min_alpha))
 
 
 class ExportWarning(UserWarning):
-    """Emitted when a property of instances is left out because the format has no place
-    for it."""
+    """Emitted when a property of instances is left out because the format cannot store
+    it."""
 
 
-# Characters that names of folders may not contain.
+# Characters that must not occur in names of folders.
 _OTHER_LETTERS = re.compile("[^A-Za-z0-9]")
 
 # The axes of a world by its up axis: y as in WebGL, z as on a globe.
@@ -49,8 +49,8 @@ def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
 def opened_with_cameras(
     subject: Scene | Bundle | File, folder: Path, cameras: Mapping[str, Camera] | None
 ) -> tuple[Scene | Bundle, Mapping[str, Camera]]:
-    """Return the subject of an export to a folder and its cameras: the named ones, else
-    those of the subject's file.
+    """Return the subject and the cameras of an export to a folder. If no cameras are
+    given, they are those of the subject's file.
 
     Raises:
         TypeError: `cameras` is not a mapping from names to cameras.
@@ -67,8 +67,8 @@ def opened_with_cameras(
 
 
 def exported(scene: Scene, format_name: str) -> Scene:
-    """Return the instances of a scene that are visible, for a format without opacity
-    and tint. Emit a warning if any instance has one of these."""
+    """Return the visible instances of a scene, for a format without opacity and tint.
+    Emit a warning if any instance has an opacity or a tint."""
     if scene.factors is None:
         return scene
     visible = copy.copy(scene)
@@ -86,15 +86,15 @@ def exported(scene: Scene, format_name: str) -> Scene:
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:
-    """Return a folder name for each bundle, derived from the name of its file. Reserved
-    names are not used."""
+    """Return a folder name for each bundle. It is derived from the name of the bundle's
+    file. Reserved names are not used."""
     stems = [beside(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
     return distinct([_OTHER_LETTERS.sub("_", stem) for stem in stems], reserved)
 
 
 def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
-    """Return distinct names: a number is appended to each name that is reserved or
-    equals an earlier one, ignoring case."""
+    """Return distinct names. A number is appended to each name that is reserved, or
+    that equals an earlier one if case is ignored."""
     results: list[str] = []
     used = {name.casefold() for name in reserved}
     for number, name in enumerate(names):
@@ -115,7 +115,7 @@ def rows_by(numbers: NDArray[np.int32] | NDArray[np.int64], count: int) -> list[
 
 
 def detail_of(bundle: Bundle) -> dict[str, float]:
-    """Return the distances at which levels become fine enough. For level 1, the
+    """Return the distances from which on levels are fine enough. For level 1, the
     distance is `reach` times the focal length in px, divided by √tolerance.
 
     For each further level, the distance is `ratio` times that of the level before.
@@ -130,18 +130,19 @@ def detail_of(bundle: Bundle) -> dict[str, float]:
     if not reach:
         return {"reach": 0.0, "ratio": math.sqrt(2)}
     ratio = (reach[-1] / reach[0]) ** (1 / max(1, len(reach) - 1))
-    # The viewer's engine accepts no smaller ratio.
+    # The engine of the web page accepts no smaller ratio.
     return {"reach": reach[0], "ratio": max(ratio, 1.2)}
 
 
 def write_document(path: Path, document: Mapping[str, object]) -> None:
     """Write JSON without spaces. The file need not be replaced atomically, because its
-    folder is moved into place later."""
+    folder is moved to its final place later."""
     path.write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
 
 
 def write_page(folder: Path, name: str) -> None:
-    """Write the page of an export: a copy of the package's file with this name."""
+    """Write the web page of an export, which is a copy of the package's file with this
+    name."""
     (folder / "index.html").write_bytes(files("v3dg.export").joinpath(name).read_bytes())
 
 

@@ -1,10 +1,10 @@
-"""Replaces the files of an earlier export in a folder, and changes nothing else there.
+"""Replaces the files of an earlier export in a folder, and changes nothing else in it.
 
-New files are written to `new` in a hidden subfolder, so that all moves stay within one
-file system. When they are complete, their record is written beside `new`. Then the
+New files are written to `new` in a hidden subfolder, so that all moves stay inside one
+file system. When they are complete, their record is written next to `new`. Then the
 files that they replace are moved to `old`, and the new files are moved into place.
-Moving the record completes the export. Until then, everything can be moved back: at
-once after an error, or when the next export begins if the process was killed.
+Moving the record completes the export. Until then, everything can be moved back. This
+is done immediately after an error, or by the next export if the process was killed.
 """
 
 import contextlib
@@ -41,9 +41,9 @@ class NewFiles:
     """The folder for the files of a new export.
 
     Attributes:
-        path: A folder for the new files, which are moved into place at the end.
-        earlier: Names of files of an earlier export that are unchanged. These are
-            replaced or removed at the end; all other files stay.
+        path: A folder for the new files. At the end, they are moved into place.
+        earlier: Names of files of an earlier export that are unchanged. They are
+            replaced or removed at the end; all other files are kept.
     """
 
     path: Path
@@ -73,15 +73,15 @@ def replacing_export(
     earlier export.
 
     The folder itself is kept, with its permissions. After an error, its content is as
-    before, and a folder that did not exist is removed again.
+    before; if the folder did not exist, it is removed.
 
     Args:
-        folder: The folder to write; a link to a folder stays a link.
+        folder: The folder to write. If it is a link to a folder, the link is kept.
         scene: The exported scene, whose files must not be in the folder.
-        certain: Names of files that will be written in any case; whether they may be
-            replaced is checked at once.
+        certain: Names of files that will be written in any case. Whether they may be
+            replaced is checked at the beginning.
         overwrite: Whether files with the same names may be replaced even if they are
-            not from an earlier export. All other files stay in any case.
+            not from an earlier export. All other files are kept in any case.
 
     Raises:
         ValueError: An input is in the folder, ``folder`` is not a folder, a file must
@@ -115,7 +115,7 @@ def replacing_export(
 
 
 def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
-    """Move back the files of an export that did not finish, and remove its hidden
+    """Move the files of an export that did not finish back, and remove its hidden
     folder."""
     # Errors of moving files back are ignored, because the error of the export is
     # reported.
@@ -141,8 +141,7 @@ def _made(folder: Path) -> Iterator[Path]:
         yield target
     except BaseException:
         for path in missing:
-            # A folder stays if it is not empty because another program has written to
-            # it.
+            # If another program has written to a folder, it is not empty and is kept.
             with contextlib.suppress(OSError):
                 path.rmdir()
         raise
@@ -150,7 +149,7 @@ def _made(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _naming_errors(folder: Path, target: Path) -> Iterator[None]:
-    """Replace paths in the hidden folder by their final paths in system errors."""
+    """In system errors, replace paths in the hidden folder by their final paths."""
     try:
         yield
     except OSError as error:
@@ -243,10 +242,11 @@ def _stamp(root: Folder, name: str) -> Stamp:
 
 
 def _restore(root: Folder, hidden: str, folder: Path) -> bool:
-    """Move back all files that an unfinished export has moved; return whether all files
+    """Move all files that an unfinished export has moved back. Return whether all files
     are in place again."""
     record = read_record(root, f"{hidden}/{RECORD}", folder / hidden / RECORD)
-    if record is None:  # the export had not moved anything yet, or it had finished
+    # either the export has not moved anything yet, or it has finished
+    if record is None:
         return True
     earlier = read_record(root, f"{hidden}/old/{RECORD}", folder / hidden / "old" / RECORD)
     earlier = earlier or read_record(root, RECORD, folder / RECORD) or Record({}, [])
@@ -278,17 +278,17 @@ def _remove_unused_folders(root: Folder, hidden: str, folder: Path) -> None:
 
 
 def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
-    """Clean up after an export that was killed: move back the files that it moved, and
+    """Clean up after an export that was killed. Move back the files that it moved, and
     remove the files that records list.
 
-    Files that were written before the record stay.
+    Files that were written before the record are kept.
     """
     with contextlib.suppress(OSError, ValueError):
         if not _restore(root, hidden, folder):
             return
         _remove_unused_folders(root, hidden, folder)
-        # The record in the hidden folder is that of the killed export if it was undone,
-        # or else that of the earlier export.
+        # If the killed export was undone, the record in the hidden folder is its own.
+        # Otherwise, it is that of the earlier export.
         present = read_record(root, RECORD, folder / RECORD)
         folders: set[str] = set()
         if present is not None:

@@ -2,8 +2,9 @@
 files.
 
 The record is in the folder of the export, so any program may have changed it.
-Therefore, only names that an export can write are accepted, all of which are below the
-folder; and a file counts as written by an export only if its size and its hash match.
+Therefore, two rules apply. Only names that an export can write are accepted, all of
+which are below the folder. A file counts as written by an export only if its size and
+its hash match.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ from v3dg.export._below import Folder
 RECORD = "v3dg-export.json"
 _FORMAT = "v3dg-export"
 _VERSION = 1
-_MOST_BYTES = 64 << 20  # bytes; the size of a record of a million files
+_MOST_BYTES = 64 << 20  # bytes; a record of a million files has this size
 _PIECE_BYTES = 1 << 20
 _HASH_BYTES = 16
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9_]{1,100}(/[A-Za-z0-9_]{1,100})?")
@@ -36,7 +37,7 @@ _HASH = re.compile(f"[0-9a-f]{{{2 * _HASH_BYTES}}}")
 
 
 class Stamp(NamedTuple):
-    """The identity of a file. A different file, or a file that was written to, has a
+    """The identity of a file. Another file, or a file that was written to, has a
     different stamp."""
 
     inode: int
@@ -55,19 +56,18 @@ class Content:
 
 @dataclass(frozen=True)
 class Record:
-    """The files of an export, by names relative to its folder, and the folders that
-    were created for them."""
+    """The files of an export by names relative to its folder, and the folders that were
+    created for them."""
 
     files: dict[str, Content]
     folders: list[str]
 
     @classmethod
     def of_files_below(cls, path: Path) -> "Record":
-        """Return the record of all files below a folder to which no other program
-        writes; without folders.
+        """Return the record of all files below a folder, without the folders. No other
+        program may write to the folder.
 
-        Files are sorted so that those in subfolders come first, because the other files
-        refer to those in subfolders.
+        Files in subfolders come first, because the other files refer to them.
         """
         names = [file.relative_to(path).as_posix() for file in path.rglob("*") if not file.is_dir()]
         assert all(_FILE_NAME.fullmatch(name) and name != RECORD for name in names), names
@@ -91,12 +91,12 @@ class Record:
 
 
 def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
-    """Read a record; return None if it does not exist.
+    """Read a record. Return None if it does not exist.
 
     Args:
         root: The folder of the export.
         name: The name of the record, relative to `root`.
-        display_path: The path of the record in error messages.
+        display_path: The path of the record in error texts.
 
     Raises:
         ValueError: The file is not a record, or contains a name that no export writes.
@@ -134,7 +134,7 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
 
 
 def _checked_name(node: Node, pattern: re.Pattern[str]) -> str:
-    """Return a name that an export can write; raise ValueError for any other name,
+    """Return a name that an export can write. Raise ValueError for any other name,
     which could be outside the folder or belong to another program."""
     name = node.value
     if not isinstance(name, str) or not pattern.fullmatch(name) or name == RECORD:
@@ -155,8 +155,8 @@ def _content_of_node(node: Node) -> Content:
 
 
 def stamp_of_content(root: Folder, name: str, content: Content) -> Stamp | None:
-    """Return the stamp of a file with exactly this content; None for other content, or
-    if the file cannot be read."""
+    """Return the stamp of a file with exactly this content. Return None for other
+    content, or if the file cannot be read."""
     try:
         descriptor = root.open_file(name)
     except (OSError, ValueError):
@@ -173,7 +173,7 @@ def stamp_of_status(status: os.stat_result) -> Stamp:
 
 
 def is_file(status: os.stat_result) -> bool:
-    """Return whether a status is that of a regular file; links are not."""
+    """Return whether a status is that of a regular file. A link is not one."""
     return stat.S_ISREG(status.st_mode)
 
 
@@ -191,7 +191,7 @@ def _digest_of(file: io.FileIO) -> str:
 
 
 def folders_of(names: Iterable[str]) -> list[str]:
-    """Return the folders that contain files with these names, the outermost first."""
+    """Return the folders that contain files with these names, outermost first."""
     return sorted(
         {name[:end] for name in names for end, letter in enumerate(name) if letter == "/"}
     )

@@ -1,5 +1,5 @@
-"""Measures in pictures how much the coarser levels of chunks differ from the finest:
-the `errors` of streamed SOG."""
+"""Measures in pictures how much the coarser levels of chunks differ from the finest
+level. These are the `errors` of streamed SOG."""
 
 from collections import defaultdict
 from typing import NamedTuple
@@ -13,10 +13,10 @@ from v3dg.gaussians import Gaussians
 from v3dg.rasterize import rasterize
 
 _SIDE_PX = 64
-# Radians; narrow, so that all parts of a chunk appear at about the same scale.
+# radians; narrow, so that all parts of a chunk appear at about the same scale
 _FOV = 0.3
 _DIRECTIONS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-_FILTER_PX2 = 0.3  # px²; the filter that viewers of this format use
+_FILTER_PX2 = 0.3  # px²; viewers of this format use this filter
 
 
 class _Finest(NamedTuple):
@@ -27,12 +27,12 @@ class _Finest(NamedTuple):
 
 
 class ChunkErrors:
-    """Collects the errors of the levels of chunks, which are added from the finest to
-    the coarsest.
+    """Collects the errors of the levels of chunks. The levels are added from the finest
+    to the coarsest.
 
     An error is the mean squared difference of colour and alpha from pictures of the
-    finest level, which are taken from four sides. Errors never decrease from a level to
-    the next coarser one. 128 KiB of pictures are kept for each chunk.
+    finest level, which are taken from four sides. Errors never decrease from one level
+    to the next coarser one. The pictures of each chunk need 128 KiB.
 
     Attributes:
         of_chunk: For each chunk, the errors of its levels.
@@ -43,7 +43,7 @@ class ChunkErrors:
         self._finest: dict[int, _Finest] = {}
 
     def add(self, chunk: int, gaussians: Gaussians) -> None:
-        """Add the next coarser level of a chunk, which may be empty."""
+        """Add the next coarser level of a chunk. It may be empty."""
         errors = self.of_chunk[chunk]
         error = 0.0
         if len(gaussians) and chunk not in self._finest:
@@ -60,7 +60,10 @@ class ChunkErrors:
 
 
 def _cameras_around(gaussians: Gaussians) -> list[Camera]:
-    """Return cameras on four sides of the gaussians that show most of them."""
+    """Return cameras on four sides of the gaussians.
+
+    Together, they show most of them.
+    """
     centre, radius = ball_of_most(gaussians.means.astype(np.float64))
     distance = max(radius, 1e-6) / np.sin(_FOV / 2)
     return [

@@ -1,9 +1,9 @@
 """Makes the coarser levels of chunks, above the level at which each chunk is a single
 group.
 
-Further levels of a bundle have groups that span several chunks. Viewers choose the
+The higher levels of a bundle have groups that span several chunks. Viewers choose the
 level of each chunk independently, so a part of such a group could be empty, or leave
-gaps beside a neighbour at another level. Therefore, each chunk is halved separately,
+gaps next to a neighbour at another level. Therefore, each chunk is halved separately,
 down to one gaussian. Then any choice of levels is a cut.
 """
 
@@ -22,43 +22,43 @@ from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.plan import Offsets
 
-# With a small budget, viewers draw levels larger than the native size of a bundle's
-# levels. Fits at four times the area are up to 1 dB better there, and no worse at the
+# With a small budget, viewers draw levels larger than their native size. If levels are
+# fitted at four times the area, they are up to 1 dB better there, and no worse at the
 # native size.
 _PX2_PER_GAUSSIAN = 8.0
-_STEPS = 150  # four times as many do not improve the result
-_LEVEL = 9  # a level of a bundle whose targets have the most samples
+_STEPS = 150  # four times as many steps do not improve the result
+_LEVEL = 9  # a level of a bundle whose targets have the maximum number of samples
 # Number of chunks whose levels are fitted together. Ctrl-C is handled between these
 # fits.
 _CHUNKS_AT_ONCE = 256
 
 
 class LevelFilter(NamedTuple):
-    """The filter with which a level is drawn; see `v3dg.bundle.tables`."""
+    """The filter with which a level is drawn, as in `v3dg.bundle.tables`."""
 
     px2: float
     is_compensated: bool
 
 
 def num_halvings(num_gaussians: int) -> int:
-    """Return the number of halvings that reduce this many gaussians to one."""
+    """Return how often this many gaussians must be halved until one is left."""
     return max(0, num_gaussians - 1).bit_length()
 
 
 def halved_levels(chunks: Sequence[Gaussians], drawn: LevelFilter) -> list[list[Gaussians]]:
-    """Make further levels of chunks, each with half as many gaussians, down to one
-    gaussian per chunk.
+    """Make more levels of chunks. Each has half as many gaussians as the one before,
+    down to one gaussian per chunk.
 
-    The levels are drawn with the filter of a bundle's levels, and fitted to the chunks
-    drawn with the filter `drawn`.
+    The levels are drawn with the filter of a bundle's levels. They are fitted to the
+    chunks, drawn with the filter `drawn`.
 
     Args:
         chunks: The gaussians of C chunks at their coarsest level, at least one each.
         drawn: The filter with which the chunks themselves are drawn.
 
     Returns:
-        Levels, each a list of C chunks. A chunk that is reduced to one gaussian keeps
-        it in all further levels.
+        Levels, each a list of C chunks. A chunk with one gaussian stays the same in all
+        higher levels.
     """
     num_levels = num_halvings(max(map(len, chunks), default=0))
     levels: list[list[Gaussians]] = [[] for _ in range(num_levels)]
@@ -105,7 +105,7 @@ def _fit(
     drawn: LevelFilter,
     first_chunk: int,
 ) -> None:
-    """Fit all levels of all chunks in place; `ends` are the boundaries of their
+    """Fit all levels of all chunks in place. `ends` has the boundaries of their
     gaussians."""
     num_chunks = len(finest_offset) - 1
     num_levels = (len(ends) - 1) // num_chunks

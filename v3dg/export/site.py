@@ -1,8 +1,8 @@
-"""Exports a scene as a web page: each bundle as streamed SOG, the instances, cameras,
-and a page that draws them.
+"""Exports a scene as a web page: each bundle as streamed SOG, the instances, the
+cameras, and a web page that draws them.
 
-The page only needs a static web server and PlayCanvas's engine, which is one file of
-its npm package.
+The web page only needs a static web server and PlayCanvas's engine, which is one file
+of its npm package.
 """
 
 import math
@@ -36,7 +36,7 @@ ENGINE = "playcanvas.min.mjs"
 _START_ASPECTS = (0.4, 0.5, 0.6, 0.75, 1.0, 4 / 3, 16 / 9, 2.4)
 SITE_NEEDS = "npm install playcanvas@2.23.3", f"cp node_modules/playcanvas/build/{ENGINE} {{}}/"
 """Commands that put PlayCanvas's engine into a folder, in the version with which the
-page is tested."""
+web page is tested."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class Site:
         bundles: Number of distinct bundles.
         instances: Number of instances.
         gaussians: Number of gaussians in the finest level of all instances together.
-        coarsest: Number of gaussians in the coarsest level of all instances together:
-            the fewest that a viewer can draw.
+        coarsest: Number of gaussians in the coarsest level of all instances together,
+            which is the minimum that a viewer can draw.
         bytes: Total size of the written files.
-        has_engine: Whether PlayCanvas's engine is beside the page.
+        has_engine: Whether PlayCanvas's engine is next to the web page.
     """
 
     bundles: int
@@ -77,25 +77,25 @@ def write_site(
     The levels of a single bundle are written to the folder itself, and those of a
     scene's bundles to one subfolder each. Opacity and tint of instances are left out
     with a warning. If PlayCanvas's engine is not in the folder yet, it is copied from
-    `node_modules` in the working directory or above.
+    `node_modules` in the working directory or in a folder above it.
 
     Args:
         subject: A scene or a bundle, or the path of its file. The file of a scene may
             also contain cameras.
-        folder: The folder to write. It may be new, empty, or contain an earlier export.
-            Missing parent folders are created. `v3dg-export.json` in it lists the
-            written files, and only those are replaced or removed by a later export.
-        cameras: Cameras that the page offers, by name. The page starts with the first
+        folder: The folder to write. It may be new or empty, or contain an earlier
+            export. Missing parent folders are created. `v3dg-export.json` in it lists
+            the written files, and only these are replaced or removed by a later export.
+        cameras: Cameras that the web page offers, by name. It starts with the first
             one.
         chunk: See `write_streamed_sog`.
-        up: The axis that points up in the world; None uses the axis of
+        up: The axis that points up in the world. None uses the axis of
             `v3dg.upright.up_of`.
         progress: See `v3dg.build_bundle`.
         overwrite: See `write_streamed_sog`.
 
     Raises:
         TypeError: `cameras` is not a mapping from names to cameras.
-        ValueError: The scene has no instances; or see `write_streamed_sog`.
+        ValueError: The scene has no instances. See also `write_streamed_sog`.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
@@ -127,8 +127,8 @@ def write_site(
 class _Axes(NamedTuple):
     """The axes that point up."""
 
-    asset: Axis  # up in the asset, which is rotated so that this axis becomes -y
-    files: Axis  # up in the world of the written files, after that rotation
+    asset: Axis  # points up in the asset, which is rotated so that this axis becomes -y
+    files: Axis  # points up in the written files, after that rotation
     cameras: Axis
 
 
@@ -143,8 +143,8 @@ def _axes(up: Axis, *, is_scene: bool) -> _Axes:
 def _write_bundles(
     plans: list[Plan], names: list[str], folder: Path, turn: Floats, progress: Progress
 ) -> list[Export]:
-    """Write the levels of each bundle to the folder with its name, which is created
-    unless it is `.`."""
+    """Write the levels of each bundle to the folder with its name. The folder is
+    created unless it is `.`."""
     levels: list[Export] = []
     with Bar(sum(plan.num_gaussians for plan in plans), "export", progress) as bar:
         for name, plan in zip(names, plans, strict=True):
@@ -156,12 +156,12 @@ def _write_bundles(
 def _document(
     scene: Scene, bundles: list[dict[str, object]], axes: _Axes, cameras: Mapping[str, Camera]
 ) -> dict[str, object]:
-    """Return the document that the page loads first."""
+    """Return the document that the web page loads first."""
     return {
         "version": 1,
         "tolerance": DEFAULT_TOLERANCE,
         # Rotations, column by column, from the worlds of the files and of the cameras
-        # to a world with y up.
+        # to a world in which y points up.
         "rotation": _common.rotation_to(axes.files, "y").T.tolist(),
         "camera_rotation": _common.rotation_to(axes.cameras, "y").T.tolist(),
         "bundles": bundles,
@@ -172,7 +172,7 @@ def _document(
 
 
 def _start_views(scene: Scene, up: Axis) -> list[dict[str, object]]:
-    """Return the first views for a page without cameras, for windows from narrow to
+    """Return the first views for a web page without cameras, for windows from narrow to
     wide."""
     framing = frame_subject(scene)
     views = []
@@ -193,7 +193,7 @@ def _bundle(name: str, plan: Plan, levels: Export) -> dict[str, object]:
 
 
 def _reach_of_half(bundle: Bundle) -> float:
-    """Return the `reach` of `detail_of` for a bundle of one level, whose single chunk
+    """Return the `reach` of `detail_of` for a bundle with one level, whose single chunk
     is halved."""
     corners = bundle.clusters.box[np.diff(bundle.clusters.offset) > 0].reshape(-1, 3)
     radius = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
@@ -201,8 +201,8 @@ def _reach_of_half(bundle: Bundle) -> float:
 
 
 def _instances(scene: Scene) -> dict[str, list[int] | list[float]]:
-    """Return the columns of the instances, with nine significant digits: float32 needs
-    no more."""
+    """Return the columns of the instances with nine significant digits, because float32
+    needs no more."""
     columns: dict[str, list[int] | list[float]] = {"bundle": scene.instance_bundle.tolist()}
     for name in ("positions", "quaternions", "scales", "importance"):
         values = getattr(scene, name).ravel().tolist()
@@ -221,11 +221,11 @@ def _camera(name: str, camera: Camera) -> dict[str, object]:
 
 
 def _bring_engine(folder: Path, new: NewFiles) -> bool:
-    """Put PlayCanvas's engine beside the page; return whether it was found, in the
+    """Put PlayCanvas's engine next to the web page. Return whether it was found, in the
     folder or in `node_modules`.
 
     If an earlier export copied the engine, it becomes part of the new export. If a user
-    put it there, it stays.
+    put it there, it is not touched.
     """
     present = folder / ENGINE
     if present.is_file() and ENGINE not in new.earlier:

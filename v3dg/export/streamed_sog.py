@@ -2,11 +2,12 @@
 SuperSplat.
 
 The asset is divided into chunks, which are subtrees of the bundle, and viewers choose a
-level for each chunk. Any choice is a cut without gaps: up to the level at which a chunk
-is a single group, the levels are those of the bundle; above it, each chunk is halved
+level for each chunk. Any choice is a cut without gaps. Up to the level at which a chunk
+is a single group, the levels are those of the bundle. Above it, each chunk is halved
 separately. No level of a chunk is empty, because PlayCanvas's engine may keep drawing a
-finer level instead of an empty one. Chunks of the same level are stored side by side in
-folders of SOG, and `lod-meta.json` lists the rows of each chunk in these folders.
+finer level instead of an empty one. Chunks of the same level are stored next to each
+other in folders of SOG, and `lod-meta.json` lists the rows of each chunk in these
+folders.
 """
 
 import functools
@@ -44,15 +45,15 @@ from v3dg.upright import up_of
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
 DEFAULT_CHUNK = 16384
-# Chunks are added to a folder until it has this number of gaussians, which is about one
-# megabyte to download at once.
+# Chunks are added to a folder until it has this number of gaussians. A folder is then
+# about one megabyte to download.
 _FOLDER_GAUSSIANS = 1 << 17
-_FOV_DEGREES = 50.0  # vertical field of view of a viewer's first camera
+_FOV_DEGREES = 50.0  # vertical field of view of the first camera
 
 
 class _Lod(TypedDict):
-    """The rows of a chunk at a level: `count` rows from row `offset` on, in the SOG
-    folder with index `file`."""
+    """The rows of a chunk at a level: `count` rows, beginning at row `offset`, in the
+    SOG folder with index `file`."""
 
     file: int
     offset: int
@@ -60,8 +61,8 @@ class _Lod(TypedDict):
 
 
 class _Leaf(TypedDict):
-    """The levels of a chunk, with numbers as strings, and the error of each level
-    compared with the finest."""
+    """The levels of a chunk, whose numbers are strings, and the error of each level
+    compared with the finest one."""
 
     lods: dict[str, _Lod]
     errors: list[float]
@@ -100,7 +101,7 @@ class Export:
 
     Attributes:
         counts: Number of gaussians in each level, finest first.
-        chunks: Number of chunks, for each of which viewers choose a level.
+        chunks: Number of chunks. Viewers choose a level for each of them.
         files: Number of folders of SOG.
         bytes: Total size of the written files.
     """
@@ -128,17 +129,17 @@ def write_streamed_sog(
 
     Args:
         bundle: A bundle, or the path of its file.
-        folder: The folder to write. It may be new, empty, or contain an earlier export.
-            Missing parent folders are created. `v3dg-export.json` in it lists the
-            written files, and only those are replaced or removed by a later export.
-        chunk: Largest number of the asset's gaussians in a chunk. Smaller chunks adapt
+        folder: The folder to write. It may be new or empty, or contain an earlier
+            export. Missing parent folders are created. `v3dg-export.json` in it lists
+            the written files, and only these are replaced or removed by a later export.
+        chunk: Maximum number of the asset's gaussians in a chunk. Smaller chunks adapt
             better to the view, but viewers draw at least one gaussian of each chunk.
         up: The axis of the asset that points up. It is rotated to the up axis of
-            viewers, -y; most trained assets need no rotation. None uses the axis of
+            viewers, -y. Most trained assets need no rotation. None uses the axis of
             `v3dg.upright.up_of`.
         progress: See `v3dg.build_bundle`.
-        overwrite: Whether to write to any folder and replace files with the same names
-            there. All other files stay.
+        overwrite: Whether to write to any folder, and to replace files with the same
+            names in it. All other files are kept.
 
     Raises:
         ValueError: ``folder`` contains other files or the bundle's file; a file of the
@@ -229,8 +230,8 @@ def _write_sog(folder: Path, gaussians: Gaussians) -> None:
 def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
     """Return settings for SuperSplat's viewer: a camera that shows most of the asset,
     and no effects."""
-    # SuperSplat's world has y up. It assumes that the asset has y down, and rotates it
-    # by half a turn about z.
+    # In SuperSplat's world, y points up. It assumes that y points down in the asset,
+    # and rotates it by half a turn about z.
     centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))
     distance = 1.2 * radius / math.sin(math.radians(_FOV_DEGREES) / 2)
     position = centre + distance * np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
@@ -241,14 +242,14 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class Plan:
-    """The division of a bundle into chunks: the groups of its level `top`, or the whole
-    bundle if it has only one level.
+    """The division of a bundle into chunks. They are the groups of its level `top`, or
+    the whole bundle if it has only one level.
 
     Attributes:
-        chunk_of_cluster: (C,) index of the cluster's chunk; -1 for clusters of levels
-            coarser than `top`.
-        chunk_of_group: (G,) index of the chunk that is formed by a group of level
-            `top`; -1 for groups of other levels.
+        chunk_of_cluster: (C,) index of the cluster's chunk, or -1 for clusters of
+            levels above `top`.
+        chunk_of_group: (G,) index of the chunk that a group of level `top` forms, or -1
+            for groups of other levels.
     """
 
     bundle: Bundle
@@ -283,8 +284,8 @@ class Plan:
         number = np.full(len(groups), -1, np.int64)
         tops = np.flatnonzero(groups.level == top)
         number[tops] = np.arange(len(tops))
-        # Clusters belong to the chunk of the group that replaces them; those of level
-        # `top` belong to the group that made them.
+        # A cluster belongs to the chunk of the group that replaces it. A cluster of
+        # level `top` belongs to the group that made it.
         group = np.where(clusters.level < top, clusters.parent_group, clusters.own_group)
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
         return cls(bundle, top, len(tops), chunk_of_cluster, number)
@@ -306,8 +307,8 @@ class Plan:
     @functools.cached_property
     def _source(self) -> NDArray[np.int64]:
         """(top + 1, K) the level of the bundle from which a level of a chunk is taken.
-        It is the same level or, if the chunk has no gaussians there, the nearest finer
-        one, else the nearest coarser one."""
+        It is the same level. If the chunk has no gaussians there, it is the nearest
+        finer one, or else the nearest coarser one."""
         level = np.arange(self.top + 1)[:, None]
         present = np.where(self._bundle_sizes > 0, level, -1)
         finer = np.maximum.accumulate(present, axis=0)
@@ -344,7 +345,7 @@ class Plan:
             yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in clusters])
 
     def _halved_levels(self) -> Iterator[list[Gaussians]]:
-        """Yield the levels above `top`; chunks without gaussians stay empty."""
+        """Yield the levels above `top`. Chunks without gaussians stay empty."""
         chunks = list(self._parts(self.top))
         used = [number for number, chunk in enumerate(chunks) if len(chunk)]
         clusters = self.bundle.clusters

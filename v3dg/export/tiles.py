@@ -1,10 +1,11 @@
-"""Exports scenes and bundles as 3D Tiles 1.1: each group of a bundle is a tile, refined
-by replacement.
+"""Exports scenes and bundles as 3D Tiles 1.1. Each group of a bundle is a tile that is
+refined by replacement.
 
 The content of a tile is the clusters that its group made. Its children are the groups
 below or, for groups of level 1, the gaussians of the asset. An instance is a tile that
-transforms the tileset of its bundle. Geometric errors are chosen so that a screen-space
-error of 16 px, the usual limit of renderers, corresponds to v3dg's tolerance of 3 px².
+transforms the tileset of its bundle. Geometric errors are chosen such that a
+screen-space error of 16 px, the usual limit of renderers, corresponds to v3dg's
+tolerance of 3 px².
 """
 
 import math
@@ -35,13 +36,14 @@ from v3dg.upright import up_of
 
 TILESET = "tileset.json"
 CESIUM = "cesium"
-"""Folder beside the page for CesiumJS, which is not part of the export."""
+"""Folder for CesiumJS next to the web page. CesiumJS is not part of the export."""
 TILES_NEED = "npm install cesium@1.145.0", f"cp -r node_modules/cesium/Build/Cesium {{}}/{CESIUM}"
-"""Commands that put CesiumJS into a folder, in the version with which the page is
+"""Commands that put CesiumJS into a folder, in the version with which the web page is
 tested."""
 
 _SCREEN_SPACE_ERROR = 16.0  # px; the default limit of CesiumJS
-# Rotation from z up in tiles to y up in their glTF content.
+# Rotation from tiles, in which z points up, to their glTF content, in which y points
+# up.
 _TO_Y_UP = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 _CONTENT = "3DTILES_content_gltf"
 _EXTENSIONS = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
@@ -98,19 +100,19 @@ def write_tiles(
 
     Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. Importance,
     opacity and tint of instances are left out, the latter two with a warning. The
-    origin of the world is the origin of the tiles, which is the Earth's centre; viewers
+    origin of the world is the origin of the tiles, which is the Earth's centre. Viewers
     can move it elsewhere.
 
     Args:
         subject: A scene or a bundle, or the path of its file.
-        folder: The folder to write. It may be new, empty, or contain an earlier export.
-            Missing parent folders are created. `v3dg-export.json` in it lists the
-            written files, and only those are replaced or removed by a later export.
-        up: The axis that points up in the world; None uses the axis of
+        folder: The folder to write. It may be new or empty, or contain an earlier
+            export. Missing parent folders are created. `v3dg-export.json` in it lists
+            the written files, and only these are replaced or removed by a later export.
+        up: The axis that points up in the world. None uses the axis of
             `v3dg.upright.up_of`.
         progress: See `v3dg.build_bundle`.
-        overwrite: Whether to write to any folder and replace files with the same names
-            there. All other files stay.
+        overwrite: Whether to write to any folder, and to replace files with the same
+            names in it. All other files are kept.
 
     Raises:
         ValueError: ``folder`` contains other files or an input; a file of the earlier
@@ -145,7 +147,7 @@ def write_tiles(
 
 
 def _write_bundles(scene: Scene, names: list[str], folder: Path, progress: Progress) -> list[_Tile]:
-    """Write the tileset of each bundle to the folder with its name; return the root
+    """Write the tileset of each bundle to the folder with its name. Return the root
     tiles."""
     trees: list[_Tile] = []
     with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
@@ -193,8 +195,8 @@ class _Writer:
         self.tops = np.flatnonzero(groups.parent < 0).tolist() or [-1]
 
     def tile_of(self, group: int) -> _Tile:
-        """Return the tile of a group with all tiles below it. -1 stands for all of a
-        bundle without groups."""
+        """Return the tile of a group with all tiles below it. -1 means all of a bundle
+        without groups."""
         if group < 0:
             return self._tile("asset", np.arange(len(self._bundle.clusters)), 0.0, [])
         level = self._bundle.groups.level[group]
@@ -226,8 +228,8 @@ class _Writer:
 
 
 def _parent(tiles: list[_Tile]) -> _Tile:
-    """Return a tile without content that is always refined to several tiles, or the
-    tile itself if there is only one."""
+    """Return a tile without content that is always refined to several tiles. If there
+    is only one tile, return it."""
     if len(tiles) == 1 and "transform" not in tiles[0]:
         return tiles[0]
     volume = _box([_bounds(tile) for tile in tiles])
@@ -269,8 +271,8 @@ def _transforms(scene: Scene) -> Floats:
 
 def _ball_of_leaves(scene: Scene, root: Floats) -> list[float]:
     """Return the centre and the radius of a ball around the finest level of all
-    instances. The page shows this ball first, because coarse gaussians, and therefore
-    the tiles, extend far beyond it."""
+    instances. The web page first shows this ball. Coarse gaussians, and therefore the
+    tiles, extend far beyond it."""
     boxes: list[Floats] = []
     for bundle in scene.bundles:
         leaves = bundle.clusters.box[np.array(bundle.level_range(0))].astype(np.float64)
@@ -290,8 +292,8 @@ def _write_tileset(
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
-        # The extensions of all tilesets, because CesiumJS reads only the list in the
-        # first one.
+        # These are the extensions of all tilesets, because CesiumJS only reads the list
+        # in the first one.
         "extensions": {_CONTENT: extensions},
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},

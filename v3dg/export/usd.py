@@ -24,7 +24,7 @@ from v3dg.upright import up_of
 if TYPE_CHECKING:
     from pxr import Usd
 
-# Pixels of the picture for which levels have the default tolerance.
+# Number of pixels of a picture in which levels have the default tolerance.
 _PIXELS = 1920 * 1080
 _LEAST = 1e-30  # smallest distance, to avoid a division by 0
 _INSTANCES = "/world/instances"
@@ -37,17 +37,17 @@ def write_usd(
     Needs the extra `usd`.
 
     Each bundle is a prim with UsdLod's LODRootAPI. Its children are the levels, finest
-    first, as ParticleField3DGaussianSplat. A level is replaced by the next coarser one
-    at the distance at which half of the groups that make the coarser level fall below
-    the default tolerance, in a picture of 1920 x 1080 px. A scene is a PointInstancer
-    of such prims. Positions are float32. Importance, opacity and tint of instances are
-    left out, the latter two with a warning.
+    first, as ParticleField3DGaussianSplat. At a certain distance, a level is replaced
+    by the next coarser one. At this distance, half of the groups that make the coarser
+    level are below the default tolerance in a picture of 1920 x 1080 px. A scene is a
+    PointInstancer of such prims. Positions are float32. Importance, opacity and tint of
+    instances are left out, the latter two with a warning.
 
     Args:
         subject: A scene or a bundle, or the path of its file.
         path: File to write, .usd, .usda, .usdc or .usdz.
-        up: The axis that points up in the world, which is rotated to z; None uses the
-            axis of `v3dg.upright.up_of`.
+        up: The axis that points up in the world. It is rotated to z. None uses the axis
+            of `v3dg.upright.up_of`.
 
     Raises:
         ImportError: usd-core is not installed.
@@ -105,8 +105,8 @@ def _define_levels(stage: "Usd.Stage", place: str, bundle: Bundle) -> None:
     high = bundle.clusters.box[:, 1].max(axis=0)
     radius = float(np.linalg.norm(high - low)) / 2
     detail = _common.detail_of(bundle)
-    # The fraction of the picture that the ball around the box covers at the distance at
-    # which level 1 becomes fine enough.
+    # At the distance at which level 1 becomes fine enough, the ball around the box
+    # covers this fraction of the picture.
     share = math.pi * DEFAULT_TOLERANCE / _PIXELS * (radius / max(detail["reach"], _LEAST)) ** 2
     sizes = [share / detail["ratio"] ** (2 * level) for level in range(bundle.num_levels - 1)]
     heuristic = pxr.UsdLod.ScreenSizeHeuristic.Define(stage, f"/lod{place.replace('/', '_')}")

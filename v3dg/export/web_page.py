@@ -1,5 +1,5 @@
 """Exports a scene as a web page that draws it with WebGPU: quantised bundles, the scene
-file, and the viewer's modules. The page needs only a static web server."""
+file, and the viewer's modules. The web page only needs a static web server."""
 
 import copy
 import os
@@ -29,7 +29,7 @@ from v3dg.upright import direction_of, up_of
 SCENE = "scene.json"
 _WEB = Path(__file__).parent / "web"
 _CORE = "core.wasm"
-# The viewer of `v3dg view` moves its camera with these modules, too.
+# The viewer of `v3dg view` also moves its camera with these modules.
 _CAMERA_MODULES = Path(__file__).parents[1] / "viewer" / "page"
 _CAMERA_NAMES = ("camera.js", "math.js")
 _START_WIDTH = 1600
@@ -65,25 +65,25 @@ def write_web_page(
     """Write a scene or a bundle as a web page that draws it with levels of detail. The
     files of an earlier export are replaced when all new files are complete.
 
-    The page selects cuts as `v3dg.select` does, with WebAssembly, and draws them with
-    WebGPU. It reads the pages of bundles that it needs from the server, by HTTP ranges.
-    Bundles are written with the codec "quantized". Lens distortion of cameras is left
-    out.
+    The web page selects cuts as `v3dg.select` does, with WebAssembly, and draws them
+    with WebGPU. It reads the pages of bundles that it needs from the server, by HTTP
+    ranges. Bundles are written with the codec "quantized". Lens distortion of cameras
+    is left out.
 
     Args:
         subject: A scene or a bundle, or the path of its file. The file of a scene may
             also contain cameras.
         folder: See `write_site`.
-        cameras: Cameras that the page offers, by name. The page starts with the first
-            one; without cameras, with a view of the whole scene.
-        up: The axis that points up in the world; None uses the axis of
+        cameras: Cameras that the web page offers, by name. It starts with the first one
+            or, without cameras, with a view of the whole scene.
+        up: The axis that points up in the world. None uses the axis of
             `v3dg.upright.up_of`.
         progress: See `v3dg.build_bundle`.
         overwrite: See `write_streamed_sog`.
 
     Raises:
         TypeError: `cameras` is not a mapping from names to cameras.
-        ValueError: The scene has no instances; or see `write_streamed_sog`.
+        ValueError: The scene has no instances. See also `write_streamed_sog`.
         RuntimeError: The package was installed without the core for web pages, or
             another export is using the folder.
         OSError: A file cannot be written.
@@ -122,7 +122,7 @@ def _check_core() -> None:
 
 
 def _write_bundle(bundle: Bundle, path: Path) -> None:
-    """Write a bundle with the codec that the page reads."""
+    """Write a bundle with the codec that the web page reads."""
     is_file = bundle.path is not None and not is_url(bundle.path)
     if is_file and bundle.codec == Quantized.name:
         source = Path(cast(str, bundle.path))
@@ -135,7 +135,7 @@ def _write_bundle(bundle: Bundle, path: Path) -> None:
 
 
 def _write_viewer(folder: Path) -> None:
-    """Write the page and its modules."""
+    """Write the web page and its modules."""
     shutil.copyfile(_WEB / "page.html", folder / "index.html")
     modules = folder / "viewer"
     modules.mkdir()

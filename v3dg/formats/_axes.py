@@ -1,7 +1,7 @@
 """The axes of gaussians in memory and in files, and the conversions between them.
 
 Axes are named by the directions of x, y and z, as in the specification of SPZ: R or L
-(right, left), U or D (up, down), F or B (forward, back). In memory they are right,
+(right, left), U or D (up, down), F or B (forward, back). In memory, they are right,
 down, forward, as in the `.ply` files of trainers. Conversions that only change signs
 are exact.
 """
@@ -26,8 +26,8 @@ GLTF = "LUF"
 Z_UP = "RFU"
 """The axes of OpenUSD with z up, and of 3D Tiles."""
 
-# For each axis that can point up: complete axes that differ as little as possible from
-# those in memory.
+# For each axis that can point up, the complete axes that differ as little as possible
+# from those in memory.
 _AXES_FROM_UP: dict[Axis, str] = {
     "x": "URF",
     "y": OPENGL,
@@ -44,13 +44,13 @@ _DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "F": (0.0, 0.0, 1.0),
     "B": (0.0, 0.0, -1.0),
 }
-# The coordinates in which each spherical harmonic is odd. Changing the sign of such a
-# coordinate changes the sign of the harmonic.
+# The coordinates in which each spherical harmonic is odd. If the sign of such a
+# coordinate changes, the sign of the harmonic changes, too.
 _ODD = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
-# Limits for the detection of a ground: its minimum share of the points, its maximum
-# thickness and minimum width relative to the extent of all points, the maximum share of
-# points below it, and the minimum share of points above it.
+# Limits for detecting a ground: its minimum fraction of the points, its maximum
+# thickness and minimum width relative to the extent of all points, the maximum fraction
+# of points below it, and the minimum fraction of points above it.
 _GROUND_SHARE = 0.3
 _GROUND_THICKNESS = 0.03
 _GROUND_WIDTH = 0.7
@@ -60,7 +60,7 @@ _LEAST_POINTS = 256
 
 
 def axes_of_up(up: Axis) -> str:
-    """Return the axes of gaussians for which this axis points up; raise ValueError for
+    """Return the axes of gaussians for which this axis points up. Raise ValueError for
     an invalid name."""
     one_of(up, "up", tuple(_AXES_FROM_UP))
     return _AXES_FROM_UP[up]
@@ -77,7 +77,7 @@ def up_of_axes(axes: str) -> Axis:
 
 
 def turn(source: str, target: str) -> Floats:
-    """Return the (3, 3) matrix that converts vectors between two sets of axes: a
+    """Return the (3, 3) matrix that converts vectors between two sets of axes. It is a
     rotation, possibly with a reflection."""
     rows = np.array([_DIRECTIONS[letter] for letter in target])
     columns = np.array([_DIRECTIONS[letter] for letter in source]).T
@@ -85,7 +85,7 @@ def turn(source: str, target: str) -> Floats:
 
 
 def turned(gaussians: Gaussians, source: str, target: str) -> Gaussians:
-    """Return gaussians on the host, converted between two sets of axes; arrays that do
+    """Return gaussians on the host, converted between two sets of axes. Arrays that do
     not change are shared."""
     matrix = turn(source, target)
     if np.array_equal(np.abs(matrix), np.eye(3)):
@@ -122,8 +122,8 @@ def _mirrored(gaussians: Gaussians, signs: Floats) -> Gaussians:
 
 
 def up_of_ground(points: NDArray[np.floating]) -> Axis | None:
-    """Return which of y, -y and z is up, if the points (N, 3) show a ground; None if
-    they do not.
+    """Return which of y, -y and z points up if the points (N, 3) show a ground, and
+    otherwise None.
 
     A ground is thin and wide and contains many of the points. Many other points are
     above it, and hardly any below it. Only grounds perpendicular to y or z are
@@ -144,8 +144,7 @@ def up_of_ground(points: NDArray[np.floating]) -> Axis | None:
 
 def _side_above(points: Floats, axis: int) -> int:
     """Return on which side of a ground the points lie along an axis: 1 for larger
-    coordinates, -1 for smaller ones, 0 if there is no ground perpendicular to the
-    axis."""
+    coordinates, -1 for smaller ones, or 0 if no ground is perpendicular to the axis."""
     order = np.argsort(points[:, axis])
     heights = points[order, axis]
     size = int(_GROUND_SHARE * len(heights))

@@ -23,7 +23,8 @@ def conversion_note(name: str) -> str:
 
 def srgb_from_linear(gaussians: Gaussians) -> Gaussians:
     """Return the gaussians with their linear colours converted to sRGB. Spherical
-    harmonics are fitted to the converted colours in directions over the sphere."""
+    harmonics are fitted to the converted colours in directions over the whole
+    sphere."""
     bases = _core.sh_bases(gaussians.sh_degree, _directions())
     inverse = np.linalg.pinv(bases)
 
@@ -44,7 +45,7 @@ def srgb_from_linear(gaussians: Gaussians) -> Gaussians:
 
 
 def _directions() -> Floats:
-    """Return (D, 3) evenly distributed unit vectors, a Fibonacci lattice."""
+    """Return (D, 3) evenly distributed unit vectors, which form a Fibonacci lattice."""
     steps = np.arange(_NUM_DIRECTIONS)
     z = 1 - (2 * steps + 1) / _NUM_DIRECTIONS
     angles = steps * np.pi * (3 - np.sqrt(5))

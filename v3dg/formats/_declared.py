@@ -12,13 +12,14 @@ class Declared:
     """What a file, or its format, declares about its gaussians.
 
     Attributes:
-        up: The axis that points up, in the coordinates of the gaussians in memory; None
-            if neither the file nor its format determines it.
+        up: The axis that points up, in the coordinates of the gaussians in memory. It
+            is None if neither the file nor its format determines it.
         up_reason: The source of `up`, as a phrase for messages.
         antialiased: Whether the gaussians were trained with opacities that compensate
-            for the filter of the rasterizer; None if the file does not declare it.
-        notes: Sentences about content of the file that was ignored or converted,
-            without the name of the file.
+            for the filter of the rasterizer. It is None if the file does not declare
+            it.
+        notes: Sentences about content of the file that was ignored or converted. They
+            do not contain the name of the file.
         up_is_guessed: Whether `up` was only inferred from the gaussians.
     """
 

@@ -29,15 +29,14 @@ def count_of(accessor: Node) -> int:
 
 
 def has_data(accessor: Node) -> bool:
-    """Return whether an accessor has data; the elements of an accessor without data are
-    zero."""
+    """Return whether an accessor has data. Without data, its elements are zero."""
     return accessor.has("bufferView") or accessor.has("sparse")
 
 
 def column(
     document: Document, accessor: Node, count: int, widths: Sequence[int]
 ) -> Callable[[slice], Floats]:
-    """Return a function that takes a slice and returns these rows of an attribute as
+    """Return a function that takes a slice, and returns these rows of an attribute as
     doubles.
 
     Args:
@@ -64,7 +63,7 @@ def column(
 
 
 def indices(document: Document, accessor: Node, limit: int) -> NDArray[np.int64]:
-    """Return the vertex indices of a primitive, each of which is below ``limit``."""
+    """Return the vertex indices of a primitive. Each must be below ``limit``."""
     dtype = _dtype_of(accessor.field("componentType"), _INDEX_DTYPES)
     if accessor.field("type").value != "SCALAR":
         raise accessor.field("type").error("SCALAR")

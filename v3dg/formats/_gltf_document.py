@@ -19,7 +19,7 @@ MAGIC = 0x46546C67  # "glTF"
 JSON_CHUNK = 0x4E4F534A  # "JSON"
 BINARY_CHUNK = 0x004E4942  # "BIN\0"
 
-# Parsed JSON takes many times the memory of its text, except for long strings.
+# Parsed JSON needs many times the memory of its text, except for long strings.
 _MOST_JSON = 1 << 20  # bytes, not counting data: URIs
 _DATA_URI = re.compile(rb'"data:[^"\\]*"')
 _MOST_NAME = 255  # bytes of a file name
@@ -29,20 +29,20 @@ _PACKED_VIEWS = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
 class Document:
-    """The JSON of a glTF file and its buffers. Objects are looked up, and buffers read,
-    when they are needed."""
+    """The JSON of a glTF file and its buffers. Objects and buffers are only looked up
+    and read when they are needed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.claims = Claims()
         self._binary: memoryview | None = None
         self._buffers: dict[int, memoryview] = {}
-        # Contents of files by device and inode, because several buffers may refer to
+        # Contents of files, by device and inode, because several buffers may refer to
         # one file by different names.
         self._files: dict[tuple[int, int], memoryview] = {}
         content = self.claims.read(path)
         is_binary = content[:4] == b"glTF" or path.suffix.lower() != ".gltf"
-        # A file downloaded from a URL may have no suffix.
+        # A file that was downloaded from a URL may have no suffix.
         if not is_binary or content[:1] == b"{":
             text = content
             expected = "a .gltf file, glTF 2.0 as JSON in UTF-8"
@@ -62,7 +62,10 @@ class Document:
         self._arrays: dict[str, list[Json]] = {}
 
     def _text_of_binary(self, content: bytes) -> bytes:
-        """Return the JSON of a `.glb`; keep its binary chunk, which follows."""
+        """Return the JSON of a `.glb`.
+
+        Keep its binary chunk, which follows the JSON.
+        """
         expected = "a complete .glb file of glTF 2.0"
         check(self.path, len(content) >= 20, f"{expected}, got {len(content)} bytes")
         magic, version, total, size, kind = struct.unpack_from("<IIIII", content)
@@ -98,7 +101,7 @@ class Document:
                     raise version.error("glTF 2.0")
 
     def array(self, kind: str) -> list[Json]:
-        """Return one of the root's arrays; an empty list if it is missing."""
+        """Return one of the root's arrays. If it is missing, return an empty list."""
         if kind not in self._arrays:
             values: Json = []
             if self.root.has(kind):
@@ -147,7 +150,7 @@ class Document:
 
     def claim_buffers(self) -> None:
         """Add the files of all buffers to the claims. Files that cannot be read are
-        ignored here, because they may not be needed."""
+        ignored, because they may not be needed."""
         for path in self.buffer_files():
             with contextlib.suppress(OSError, ValueError), self.claims.open(path):
                 pass
@@ -179,7 +182,7 @@ class Document:
         return content
 
     def _content_at(self, uri: Node) -> memoryview:
-        """Return the bytes of a data: URI, or of a file beside the document."""
+        """Return the bytes of a data: URI, or of a file next to the document."""
         if _is_data(uri):
             media_type, _, payload = uri.value.partition(",")
             if not media_type.endswith(";base64"):
@@ -220,7 +223,7 @@ def _is_data(uri: Node) -> bool:
 
 
 def offset_of(node: Node, limit: int) -> int:
-    """Return the byteOffset of a view or an accessor; the default is 0."""
+    """Return the byteOffset of a view or an accessor. The default is 0."""
     if not node.has("byteOffset"):
         return 0
     return integer_of(node.field("byteOffset"), f"0 to {limit}", 0, limit)

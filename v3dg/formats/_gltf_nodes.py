@@ -25,18 +25,19 @@ from v3dg.rotations import (
 _INSTANCING = "EXT_mesh_gpu_instancing"
 _PARTS = ("translation", "rotation", "scale")
 # Largest difference of a rotation's determinant from 1, and largest relative difference
-# of scales that count as equal. Matrices come from float32.
+# between scales that count as equal. Matrices are computed from float32.
 _MOST_SHEAR = 1e-4
 _MOST_SPREAD = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A mesh, and the (4, 4) matrix from mesh to scene coordinates; None for the
+    """A mesh, and the (4, 4) matrix from mesh to scene coordinates, or None for the
     identity.
 
     Attributes:
-        node: The node that places the mesh, or the mesh itself if there are no nodes.
+        node: The node that places the mesh. If there are no nodes, it is the mesh
+            itself.
     """
 
     mesh: int
@@ -63,7 +64,7 @@ def placements(document: Document) -> tuple[list[Placement], list[str]]:
 
 
 def _scene_notes(document: Document, number: int) -> list[str]:
-    """Return a note if there are other scenes, which are ignored."""
+    """Return a note if the file has other scenes, which are ignored."""
     count = len(document.array("scenes"))
     if count == 1:
         return []
@@ -115,12 +116,12 @@ def _product(parent: Floats | None, local: Floats | None) -> Floats | None:
         return local
     if local is None:
         return parent
-    with np.errstate(over="ignore", invalid="ignore"):  # checked in `placed`
+    with np.errstate(over="ignore", invalid="ignore"):  # `placed` checks the values
         return np.asarray(parent @ local)
 
 
 def _local_matrix(node: Node) -> Floats | None:
-    """Return the transform of a node as a (4, 4) matrix; None for the identity."""
+    """Return the transform of a node as a (4, 4) matrix, or None for the identity."""
     parts = [name for name in _PARTS if node.has(name)]
     if node.has("matrix"):
         if parts:
@@ -152,8 +153,9 @@ def _rotation_of(node: Node) -> Floats:
 
 
 def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
-    """Return the gaussians of a mesh in scene coordinates. A transform other than a
-    rotation, a translation and positive scales is a ValueError that names the node."""
+    """Return the gaussians of a mesh in scene coordinates. If the transform is not a
+    rotation, a translation and positive scales, raise a ValueError that names the
+    node."""
     matrix = placement.matrix
     if matrix is None:
         return gaussians
@@ -178,7 +180,7 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
 
 
 def _stretched(gaussians: Gaussians, factors: Floats) -> Gaussians:
-    """Return gaussians after scaling space by a factor along each axis; colours stay
+    """Return gaussians after scaling space by a factor along each axis. Colours stay
     the same.
 
     The new scales are the singular values of the scaled axes of each gaussian.
@@ -192,7 +194,8 @@ def _stretched(gaussians: Gaussians, factors: Floats) -> Gaussians:
         scales = gaussians.scales[rows].astype(np.float64)
         axes = rotation_from_quaternion(normalised(quats)) * scales[:, None, :]
         axes *= factors[:, None]
-        # Gaussians whose values are not finite cannot be drawn. They are not changed.
+        # Gaussians whose values are not finite cannot be drawn, so they are not
+        # changed.
         is_good = np.isfinite(axes).all(axis=(1, 2))
         rotations, lengths, _ = np.linalg.svd(axes[is_good])
         rotations[:, :, 2] *= np.sign(np.linalg.det(rotations))[:, None]

@@ -24,13 +24,13 @@ from v3dg.rotations import normalised
 
 NAME = "KHR_gaussian_splatting"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
-# An extension of a draft. It belongs to the primitive itself, while the others are
+# An extension of a draft. It belongs to the primitive itself, whereas the others are
 # nested in NAME.
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
 _SPZ_WITHIN = (SPZ, "KHR_gaussian_splatting_compression_spz")
 READ_EXTENSIONS = frozenset({NAME, *_SPZ_WITHIN, _SPZ_ALONE, "KHR_mesh_quantization"})
-# Drafts call the attribute `KHR_gaussian_splatting:SCALE` just `_SCALE`; the same holds
-# for the other attributes.
+# Drafts use a short prefix. For example, they call the attribute
+# `KHR_gaussian_splatting:SCALE` just `_SCALE`.
 _PREFIXES = (f"{NAME}:", "_")
 
 _LINEAR = "lin_rec709_display"
@@ -68,10 +68,11 @@ class _Packed:
 
 
 class Primitive:
-    """A primitive of gaussians. Until `read` is called, only its size is read.
+    """A primitive of gaussians. Until `read` is called, only its size is known.
 
     Attributes:
-        count: Number of gaussians: vertices, or indices if the primitive has any.
+        count: Number of gaussians. It is the number of indices or, without indices, the
+            number of vertices.
         num_rows: Number of vertices.
         degree: Degree of their spherical harmonics.
         antialiased: As in `Declared`.
@@ -115,19 +116,20 @@ class Primitive:
 
     @property
     def packed_bytes(self) -> int:
-        """Size of the embedded `.spz` in bytes; 0 without one."""
+        """Size of the embedded `.spz` in bytes, or 0 if there is none."""
         if self._packed is None:
             return 0
         return len(self._packed.content)
 
     @property
     def _is_released(self) -> bool:
-        """Whether it has the properties that the release requires, and drafts lack.
+        """Whether the primitive has the properties that the release requires. Drafts
+        lack them.
 
-        In a draft, the `.spz` has the axes of glTF: so Cesium ion writes it, and so
-        CesiumJS takes it. Since then, "you must specify a Left-Up-Front (LUF)
-        coordinate system" to the library of `.spz`, which turns gaussians from there to
-        its own axes: KHR_gaussian_splatting_compression_spz_2, Conformance.
+        In a draft, the `.spz` has the axes of glTF: Cesium ion writes it so, and
+        CesiumJS reads it so. In the release, "you must specify a Left-Up-Front (LUF)
+        coordinate system" to the library of `.spz`, which converts gaussians from these
+        axes to its own: KHR_gaussian_splatting_compression_spz_2, Conformance.
         """
         return any(self._extension.has(name) for name in ("kernel", "colorSpace"))
 
@@ -190,8 +192,8 @@ class Primitive:
         return 0
 
     def _find(self, name: str) -> Node | None:
-        """Return the index of the accessor of an attribute, by its released name or
-        that of a draft; None if it is missing."""
+        """Return the index of the accessor of an attribute. Its name is the released
+        one or that of a draft. Return None if it is missing."""
         for prefix in _PREFIXES:
             if self._attributes.has(prefix + name):
                 return self._attributes.field(prefix + name)
@@ -200,7 +202,7 @@ class Primitive:
     def _column(self, name: str, width: int) -> Callable[[slice], Floats]:
         number = self._find(name)
         if number is None:
-            number = self._attributes.field(_PREFIXES[0] + name)  # raises an error
+            number = self._attributes.field(_PREFIXES[0] + name)  # this raises an error
         accessor = self._document.item("accessors", number)
         return column(self._document, accessor, self.num_rows, [width])
 
@@ -238,7 +240,7 @@ class Primitive:
         """Return functions for the SH coefficient of degree 0, (N, 3), and for the
         opacity, (N,).
 
-        Drafts store both in COLOR_0, whose colour is 0.5 plus the coefficient times
+        Drafts store both in COLOR_0. Its colour is 0.5 plus the coefficient times
         SH_C0.
         """
         name = "SH_DEGREE_0_COEF_0"
@@ -310,7 +312,8 @@ class Primitive:
         return notes
 
     def _attribute_notes(self) -> list[str]:
-        # Files with the released names may also have COLOR_0, for other programs.
+        # Files with the released names may also have COLOR_0, for programs that do not
+        # support gaussians.
         read = {"POSITION", "COLOR_0"}
         for prefix in _PREFIXES:
             read |= {prefix + name for name in ("SCALE", "ROTATION", "OPACITY", *coefficients(3))}

@@ -19,13 +19,13 @@ _MOST_NOTES = 20
 
 
 class Scene:
-    """The gaussians of a scene. Until `read` is called, only their numbers are read.
+    """The gaussians of a scene. Until `read` is called, only their numbers are known.
 
     Attributes:
-        count: Number of gaussians in the scene; a mesh counts once for each node that
+        count: Number of gaussians in the scene. A mesh counts once for each node that
             places it.
         degree: The highest SH degree of a primitive.
-        antialiased: As in `Declared`; None if primitives differ.
+        antialiased: As in `Declared`. It is None if primitives differ.
         notes: As in `Declared`.
     """
 
@@ -58,7 +58,8 @@ class Scene:
     def read(self) -> Gaussians:
         """Return the gaussians, in the order of nodes and primitives."""
         gaussians = empty(self.count, self.degree)
-        # For each mesh: its placements, each with the first row of its gaussians.
+        # For each mesh, its placements, and the first row of the gaussians of each
+        # placement.
         uses: dict[int, list[tuple[Placement, int]]] = {}
         row = 0
         for placement in self._placements:
@@ -83,16 +84,16 @@ class Scene:
         ]
 
     def _check_claims(self) -> None:
-        """Raise ValueError if the file is too small for its number of gaussians or for
-        the expanded size of its data."""
+        """Raise ValueError if the file is too small for its number of gaussians, or for
+        the decompressed size of its data."""
         path = self._document.path
         claims = self._document.claims
         self._document.claim_buffers()
         primitives = [primitive for mesh in self._primitives.values() for primitive in mesh]
         claims.add(path, self.count)
         claims.add(path, sum(max(0, part.num_rows - part.count) for part in primitives))
-        # The limit applies to all primitives together, so that many of them cannot
-        # share one large stream.
+        # The limit applies to all primitives together, so that they cannot all refer to
+        # one large stream.
         num_packed = sum(primitive.packed_bytes for primitive in primitives)
         limit = claims.num_bytes
         check(
@@ -131,7 +132,7 @@ def _has_gaussians(mesh: Node) -> bool:
 
 
 def _extension_notes(document: Document) -> list[str]:
-    """Return notes about ignored content; raise ValueError for a required extension
+    """Return notes about ignored content. Raise ValueError for a required extension
     that this reader does not support."""
     for name, node in _extensions(document, "extensionsRequired"):
         if name not in READ_EXTENSIONS and not name.startswith(_OTHER_EXTENSIONS):

@@ -1,4 +1,4 @@
-"""Measures the losses of gaussians that are written to a quantised format: clipped
+"""Measures what gaussians lose when they are written to a quantised format: clipped
 values, and rounding errors of the others."""
 
 import math
@@ -21,13 +21,13 @@ class Losses:
     Attributes:
         cut: Number of values that were clipped to the range of the format, by kind:
             `scales`, `colors` of degree 0, `harmonics` of higher degrees, and
-            `opacities` too small to be visible, which became 0. Kinds without clipped
-            values are missing.
+            `opacities` that became 0 because they were too small to be visible. Kinds
+            without clipped values are missing.
         position_error: Largest error of a coordinate, relative to the diameter of the
             ball that contains most gaussians.
         scale_error: Largest relative error of a scale that was not clipped.
-        rotation_error: Largest angle in degrees by which an ellipsoid is turned.
-        color_error: Largest error of a colour of degree 0 that was not clipped; 1 is
+        rotation_error: Largest angle, in degrees, by which an ellipsoid was rotated.
+        color_error: Largest error of a colour of degree 0 that was not clipped. 1 is
             the difference between black and white.
         harmonics_error: Largest error of a coefficient of a higher degree that was not
             clipped.
@@ -57,7 +57,7 @@ class Losses:
         return [*lines, f"largest errors of rounding: {errors}"]
 
     def result(self) -> JsonObject:
-        """Return the losses for a command's result as JSON."""
+        """Return the losses as JSON for the result of a command."""
         errors = {
             "positions": self.position_error,
             "scales": self.scale_error,
@@ -123,13 +123,14 @@ def _largest_error(
 
 
 def _largest_angle(quats: npt.NDArray[np.floating], read: npt.NDArray[np.floating]) -> float:
-    """Return the largest angle in degrees by which reading rotates an ellipsoid.
-    Half turns about its own axes do not turn it."""
+    """Return the largest angle, in degrees, by which reading rotates an ellipsoid. A
+    half turn about an axis of the ellipsoid does not count, because it does not change
+    the ellipsoid."""
     largest = 0.0
     for rows in blocks(len(quats)):
         inverses = normalised(quats[rows]) * np.array([1, -1, -1, -1])
-        # The largest component of such a turn is that of no turn, or of a half turn
-        # about an axis.
+        # The largest component of the quaternion of such a rotation belongs either to
+        # no rotation, or to a half turn about an axis.
         turns = np.sort(np.abs(product(inverses, normalised(read[rows]))), axis=1)
         sines = np.linalg.norm(turns[:, :3], axis=1)
         largest = max(largest, 2 * np.arctan2(sines, turns[:, 3]).max())

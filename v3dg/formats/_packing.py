@@ -18,7 +18,7 @@ Integers: TypeAlias = NDArray[np.integer]
 
 SQRT2 = math.sqrt(2.0)
 SH_C0 = _core.sh_base0
-"""The basis function of SH degree 0: a colour is 0.5 plus SH_C0 times its
+"""The basis function of SH degree 0. A colour is 0.5 plus SH_C0 times its
 coefficient."""
 
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
@@ -26,14 +26,15 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 
 # Number of gaussians that are decoded together. A block of doubles fits into the cache.
 _BLOCK = 1 << 16
-# Minimum logarithm of a scale, that of 2e-9. A scale of 0 has no finite logarithm.
+# Minimum logarithm of a scale, which is that of 2e-9. It is used for a scale of 0,
+# which has no finite logarithm.
 _MIN_LOG_SCALE = -20.0
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The ranges of values in a quantised format; other values are clipped.
+    """The ranges of values in a quantised format. Other values are clipped.
 
     Attributes:
         log_scale: Minimum and maximum logarithm of a scale.
@@ -60,7 +61,7 @@ def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ..
     """Decode gaussians in blocks. ``decode`` returns the means, quats, scales,
     opacities and sh of the gaussians in a slice."""
     gaussians = empty(count, degree)
-    # Infinities and NaN are passed on.
+    # Infinities and NaN are kept.
     with np.errstate(over="ignore", invalid="ignore"):
         for block in blocks(count):
             for array, values in zip(vars(gaussians).values(), decode(block), strict=True):
@@ -69,8 +70,8 @@ def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ..
 
 
 def quats_from_three(three: Floats, omitted: Integers) -> Floats:
-    """Return unit quaternions (N, 4), given three components and the index of the
-    omitted component, which is not negative."""
+    """Return unit quaternions (N, 4). The arguments are three components, and the index
+    of the fourth, which is not negative."""
     omitted_component = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
     quats = np.empty((len(three), 4))
     np.put_along_axis(quats, _STORED_COMPONENTS[omitted], three, axis=1)
@@ -100,13 +101,13 @@ def to_integers(values: Floats, largest: int) -> NDArray[np.uint32]:
 
 
 def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
-    """Return opacities as bytes, where 255 is opaque. Invisible opacities become 0:
-    rounded up, they would be visible."""
+    """Return opacities as bytes, where 255 is opaque. Invisible opacities become 0. If
+    they were rounded up, they would be visible."""
     return np.where(opacities < _LEAST_VISIBLE_OPACITY, 0, to_integers(opacities * 255.0, 255))
 
 
 def check_writable(gaussians: Gaussians) -> Gaussians:
-    """Return the gaussians on the host; raise a ValueError that names the first value
+    """Return the gaussians on the host. Raise a ValueError that names the first value
     that a quantised format cannot store."""
     host = gaussians.numpy()
     for name, values in vars(host).items():

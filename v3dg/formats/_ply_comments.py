@@ -20,7 +20,10 @@ _MODES: dict[str, bool | None] = {"default": False, "mip": True, "2dgs": None}
 
 
 def declared_by(comments: Iterable[str]) -> Declared:
-    """Return what comments declare; the word `comment` has been removed from them."""
+    """Return what comments declare.
+
+    The word `comment` must have been removed from them.
+    """
     antialiased = None
     up: Axis | None = None
     notes = []

@@ -20,9 +20,10 @@ from v3dg._numbers import check as check
 from v3dg.formats._declared import NOTHING, Declared
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
-_FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim to have this many
-_MAX_NAMES = 8  # names that a message lists
-_FREE_BYTES = 1 << 20  # a member of a zip may be this large, for any size of the zip
+# 15 to 62 MB; a file of any size may claim to have this many gaussians
+_FREE_GAUSSIANS = 1 << 18
+_MAX_NAMES = 8  # number of names in a message
+_FREE_BYTES = 1 << 20  # a member of a zip may have this size, however small the zip is
 
 
 AnyPath: TypeAlias = str | os.PathLike[str]
@@ -31,14 +32,16 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 @dataclass(frozen=True, eq=False)
 class AssetFile:
-    """The header of an asset's file, and its gaussians on demand; the file is open
-    until this object is dropped.
+    """The header of an asset's file, and a function that reads its gaussians. The file
+    is open while this object exists.
 
     Attributes:
-        read: Function that returns the gaussians from a first row up to an end row.
-            Reading in file order is fastest. It raises the errors of `read_asset`.
-        whole_bytes: Memory in bytes that the first read occupies until the file is
-            closed, if the format can only be read whole; else 0.
+        read: Function that returns the gaussians from a first row up to an end row. It
+            is fastest to read rows in the order of the file. It raises the errors of
+            `read_asset`.
+        whole_bytes: For formats that can only be read as a whole, the memory in bytes
+            that the first read occupies until the file is closed. It is 0 for other
+            formats.
         declared: What the file declares about its gaussians.
     """
 
@@ -73,10 +76,10 @@ def whole_file(
     files: Iterable[AnyPath] = (),
     declared: Declared = NOTHING,
 ) -> AssetFile:
-    """Return an asset file for a format that can only be read whole. The first read
-    keeps all gaussians in memory."""
+    """Return an asset file for a format that can only be read as a whole. The first
+    read keeps all gaussians in memory."""
     read_once = cache(lambda: read(path))
-    # The memory during the first read: the content of the files, and at most two copies
+    # The memory during the first read: the content of the files, and up to two copies
     # of the gaussians.
     memory = bytes_of([path, *files]) + 2 * count * gaussian_bytes(sh_degree)
     return AssetFile(
@@ -90,8 +93,8 @@ def whole_file(
 
 
 class File:
-    """A file with random access, which is closed when this object is destroyed. A file
-    that is not a regular file is a ValueError."""
+    """A file with random access, which is closed when this object is destroyed. Raises
+    ValueError unless it is a regular file."""
 
     def __init__(self, path: AnyPath) -> None:
         self.path = path
@@ -101,8 +104,8 @@ class File:
         self.num_bytes = os.fstat(self._descriptor).st_size
 
     def rows(self, dtype: np.dtype[_Scalar], offset: int, count: int) -> NDArray[_Scalar]:
-        """Return `count` records from an offset on; raise ValueError if the file has
-        been truncated meanwhile."""
+        """Return `count` records, beginning at an offset. Raise ValueError if the file
+        has been truncated in the meantime."""
         rows = np.empty(count, dtype)
         with _files.naming_errors(self.path):
             is_whole = _files.read_at(self._descriptor, rows, offset)
@@ -113,17 +116,17 @@ class File:
 
 
 def least_bytes(count: int) -> int:
-    """Return the minimum size in bytes of a file with `count` gaussians: one byte for
-    each gaussian after the first _FREE_GAUSSIANS."""
+    """Return the minimum size, in bytes, of a file with `count` gaussians. It is one
+    byte for each gaussian after the first _FREE_GAUSSIANS."""
     return max(0, count - _FREE_GAUSSIANS)
 
 
 class Claims:
-    """The files of an asset and the number of gaussians that they claim to contain. It
-    rejects files that are too small for their number of gaussians."""
+    """The files of an asset, and the number of gaussians that they claim to contain.
+    Files that are too small for this number are rejected."""
 
     def __init__(self) -> None:
-        # Size in bytes by device and inode, as a file may have several names.
+        # Sizes in bytes, by device and inode, because a file may have several names.
         self._files: dict[tuple[int, int], int] = {}
         self._gaussians = 0
 
@@ -144,8 +147,8 @@ class Claims:
         return sum(self._files.values())
 
     def add(self, path: AnyPath, count: int) -> None:
-        """Accept that a file has `count` more gaussians, or raise ValueError if the
-        files are too small for all of them. Call this before allocating memory for the
+        """Accept that a file has `count` more gaussians. Raise ValueError if the files
+        are too small for all of them. Call this before allocating memory for the
         gaussians."""
         self._gaussians += count
         num_bytes = self.num_bytes
@@ -160,8 +163,8 @@ class Claims:
 
 
 class Archive:
-    """A zip whose members have correct checksums and are no larger than the zip or 1
-    MiB."""
+    """A zip whose members have correct checksums. A member must not be larger than the
+    zip, or than 1 MiB for a smaller zip."""
 
     def __init__(self, path: AnyPath, file: IO[bytes]) -> None:
         self._path = path

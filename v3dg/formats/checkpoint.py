@@ -2,13 +2,14 @@
 splatfacto of nerfstudio, and the code of the 3DGS paper and of 2DGS.
 
 All of them store means, log scales, quaternions w x y z, opacity logits and SH
-coefficients as tensors: gsplat in a dict `splats`, nerfstudio among the values of
-`pipeline`, the code of the papers in a tuple. `_Layout` describes the differences.
+coefficients as tensors. gsplat stores them in a dict `splats`, nerfstudio among the
+values of `pipeline`, and the code of the papers in a tuple. `_Layout` describes the
+differences.
 
-The file is a zip of a pickle and of the numbers of each tensor. Of the pickle, only
-operations that build dicts, plain values and tensors are followed: nothing is imported
-or called. Of the tensors, only those of the gaussians are read. The settings of a run
-are in a YAML file beside the checkpoint; single lines of that file are read.
+The file is a zip with a pickle and the numbers of each tensor. Only those operations of
+the pickle are executed that build dicts, plain values and tensors; nothing is imported
+or called. Only the tensors of the gaussians are read. The settings of a run are in a
+YAML file next to the checkpoint, of which single lines are read.
 """
 
 import math
@@ -39,9 +40,9 @@ from v3dg.rotations import normalised
 
 _FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 _NERFSTUDIO = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-# The second prefix is that of nerfstudio before version 1.1.
+# The second prefix was used by nerfstudio before version 1.1.
 _NERFSTUDIO_PREFIXES = ("_model.gauss_params.", "_model.")
-# Indices into the tuple that the papers' code stores, in the order of _FIELDS.
+# Indices into the tuple that the code of the papers stores, in the order of _FIELDS.
 _CAPTURED = (1, 4, 5, 6, 2, 3)
 _MIN_CAPTURE = 12  # length of that tuple; variants append more values
 # Members of a checkpoint that do not describe gaussians.
@@ -67,7 +68,7 @@ _NOT_GAUSSIANS = {
 _NOT_GAUSSIANS["bilagrid"] = _NOT_GAUSSIANS["bil_grids"]
 _SETTINGS = ("cfg.yml", "config.yml")  # of gsplat and of nerfstudio
 _MAX_SETTINGS_BYTES = 1 << 20
-# Bytes; trainers write far less, and each byte could create an object.
+# Maximum size in bytes. Trainers write far less, and each byte could create an object.
 _MAX_PICKLE = 1 << 20
 _MAX_DIMENSIONS = 8
 # Operations that push a plain value on the stack.
@@ -88,8 +89,8 @@ _TYPES = {
     "HalfStorage": "<f2",
     "BFloat16Storage": "<u2",
 }
-# Modules whose names may occur in a trainer's pickle. Other names are errors, and no
-# module is imported.
+# Modules whose names may occur in a trainer's pickle. Other names raise an error, and
+# no module is imported.
 _ALLOWED_MODULES = (
     "numpy",
     "numpy.core.multiarray",
@@ -143,7 +144,7 @@ class _Layout(NamedTuple):
 
     @property
     def num_scales(self) -> int:
-        """Number of stored scales per gaussian: 2 for 2DGS, whose gaussians are
+        """Number of stored scales per gaussian. It is 2 for 2DGS, whose gaussians are
         flat."""
         if self.fields["scales"].shape[1:] == (2,):
             return 2
@@ -255,8 +256,9 @@ def _size(path: AnyPath, layout: _Layout, claims: Claims) -> tuple[int, int]:
 
 
 def _settings_of(path: AnyPath) -> _Settings:
-    """Return the settings of the run from a file in the folder of the checkpoint or the
-    folder above; defaults if there is no such file."""
+    """Return the settings of the run. They are in a file in the folder of the
+    checkpoint, or in the folder above it. If there is no such file, return the
+    defaults."""
     folder = Path(path).absolute().parent
     files = [place / name for place in (folder, folder.parent) for name in _SETTINGS]
     file = next((file for file in files if file.is_file()), None)
@@ -296,13 +298,13 @@ def _settings(values: Mapping[str, str]) -> _Settings:
 
 
 def _doubles(values: _Numbers) -> Floats:
-    if values.dtype == np.uint16:  # bfloat16: the upper half of a float32
+    if values.dtype == np.uint16:  # bfloat16, which is the upper half of a float32
         values = (values.astype(np.uint32) << 16).view(np.float32)
     return values.astype(np.float64)
 
 
 def _layout(path: AnyPath, content: _Value) -> _Layout:
-    """Return the layout of the gaussians in the pickled object; raise ValueError if a
+    """Return the layout of the gaussians in the pickled object. Raise ValueError if a
     part is missing."""
     members: dict[str, _Value] = {}
     if isinstance(content, dict):
@@ -389,7 +391,7 @@ def _tensors(path: AnyPath, values: Mapping[str, _Value]) -> dict[str, _Tensor]:
 
 
 def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: str) -> _Numbers:
-    """Return the numbers of a tensor; raise ValueError unless the file contains all of
+    """Return the numbers of a tensor. Raise ValueError unless the file contains all of
     them."""
     steps = zip(tensor.shape, tensor.strides, strict=True)
     last = tensor.offset + sum((size - 1) * step for size, step in steps)
@@ -413,7 +415,7 @@ def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: st
 
 
 class _Unpickler:
-    """Builds the object that torch.save pickled, without the values of lists and
+    """Builds the object that torch.save pickled, without the values of lists, and
     without dict entries whose key is not text.
 
     Only a few stack operations are allowed, so time and memory are proportional to the
@@ -426,7 +428,7 @@ class _Unpickler:
         self._memo: dict[int, _Value] = {}
 
     def run(self, pickle: bytes) -> _Value:
-        """Return the object in a pickle; raise ValueError for an operation or a name
+        """Return the object in a pickle. Raise ValueError for an operation or a name
         that is not allowed."""
         for opcode, argument, _ in pickletools.genops(pickle):
             if opcode.name == "STOP":
@@ -438,11 +440,11 @@ class _Unpickler:
         return self._stack.pop()
 
     def _push(self, operation: str, argument: _Value) -> bool:
-        """Apply an operation that only adds to the stack; return whether `operation` is
+        """Apply an operation that only adds to the stack. Return whether `operation` is
         one of these."""
         match operation:
             case "PROTO" | "BINPERSID":
-                # The tuple that describes a storage is used in place of the storage.
+                # The tuple that describes a storage is used instead of the storage.
                 pass
             case "MARK":
                 self._marks.append(len(self._stack))
@@ -463,7 +465,7 @@ class _Unpickler:
         return True
 
     def _combine(self, operation: str) -> bool:
-        """Apply an operation that takes values from the stack; return whether
+        """Apply an operation that takes values from the stack. Return whether
         `operation` is one of these."""
         match operation:
             case "TUPLE":
@@ -499,7 +501,7 @@ class _Unpickler:
 
 
 def _allowed_name(argument: str) -> _Named:
-    """Return the placeholder for a class or a function, given "module name"; raise
+    """Return the placeholder for a class or a function, given "module name". Raise
     ValueError if the module is not allowed."""
     module, _, name = argument.partition(" ")
     short = f"{module[:60]}.{name[:60]}"
@@ -510,7 +512,7 @@ def _allowed_name(argument: str) -> _Named:
 
 
 def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
-    """Return a placeholder for the result of a call; nothing is called."""
+    """Return a placeholder for the result of a call. Nothing is called."""
     if name.startswith("collections."):
         return {}
     if name == "torch._utils._rebuild_parameter":
@@ -519,7 +521,7 @@ def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
         return _Named(name)
     (_, storage, key, _, num_stored), offset, shape, strides = arguments[:4]
     kind = storage.name.removeprefix("torch.")
-    # Limited to the number of dimensions that a tensor may have, because many calls can
+    # Limited to the maximum number of dimensions of a tensor, because many calls can
     # share a long tuple.
     numbers = (num_stored, offset, *shape[:_MAX_DIMENSIONS], *strides[:_MAX_DIMENSIONS])
     is_plain = all(type(number) is int and 0 <= number < 1 << 48 for number in numbers)

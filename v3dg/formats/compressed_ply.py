@@ -24,13 +24,13 @@ from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
-# The radius of the inner shell is eight times the distance from the median position
-# that a tenth of the gaussians do not exceed. It contains all of a compact asset, or
-# the dense part of an asset with far gaussians.
+# The radius of the inner shell is eight times a distance. A tenth of the gaussians are
+# within this distance from the median position. The shell contains all of a compact
+# asset, or the dense part of an asset with far gaussians.
 _INNER_SHARE = 0.1
 _INNER_FACTOR = 8.0
-_SHELL_GROWTH = 4.0  # ratio of the radii of a shell and of the one inside it
-# Weights of the extents of a chunk: y has half as many steps as x and z. No weight is
+_SHELL_GROWTH = 4.0  # ratio of the radius of a shell to that of the next smaller one
+# Weights of the extents of a chunk. y has half as many steps as x and z. No weight is
 # above 1, so that coordinates do not overflow.
 _STEP_WEIGHTS = np.array([0.5, 1.0, 0.5], np.float32)
 _MAX_LOG_SCALE = 20.0
@@ -39,7 +39,7 @@ LIMITS = _packing.Limits(log_scale=(-20.0, _MAX_LOG_SCALE), harmonic=(-4.0, 4.0)
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
-# For each field of a word: its lowest bit, and its largest value.
+# For each field of a word, its lowest bit and its largest value.
 _Fields: TypeAlias = tuple[tuple[int, int], ...]
 _XYZ: _Fields = ((21, 2047), (11, 1023), (0, 2047))
 _THREE: _Fields = ((20, 1023), (10, 1023), (0, 1023))
@@ -147,7 +147,7 @@ def _decoded(
 
 def write(path: AnyPath, gaussians: Gaussians) -> Gaussians:
     """Write a `.compressed.ply` file. Gaussians are reordered so that each chunk
-    contains neighbours in space; returns them in the order of the file."""
+    contains neighbours in space. Return them in the order of the file."""
     host = _packing.check_writable(gaussians)
     host = host.subset(chunk_order(host))
     count = len(host)
@@ -162,8 +162,8 @@ def write(path: AnyPath, gaussians: Gaussians) -> Gaussians:
     ranges = []
     fractions = {}
     for kind, array in values.items():
-        # The bounds are rounded before use, so that the writer and the reader have the
-        # same range.
+        # The limits are rounded before they are used, so that the writer and the reader
+        # have the same range.
         low = np.minimum.reduceat(array, starts).astype(np.float32)
         high = np.maximum.reduceat(array, starts).astype(np.float32)
         ranges += [low, high]
@@ -196,9 +196,9 @@ def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
 
     The range of a chunk is divided into 1,024 or 2,048 steps, so a chunk with far
     gaussians would be too coarse for near ones. Therefore the file contains one shell
-    around the median position after another, each in chunks of a median split. The
-    gaussians of a shell that do not fill a chunk are its least visible ones; they share
-    a chunk with the innermost gaussians of the next shells.
+    around the median position after another, each in chunks of a median split. If the
+    gaussians of a shell do not fill its last chunk, the least visible ones are left
+    over. They share a chunk with the innermost gaussians of the next shells.
     """
     distances = _distances(gaussians.means)
     shells = _shells(distances)
@@ -207,7 +207,7 @@ def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
     by_shell = np.argsort(shells, kind="stable")
     ends = np.cumsum(np.bincount(shells))
     parts = []
-    remaining = by_shell[:0]  # less than a chunk, from the shells inside
+    remaining = by_shell[:0]  # left over from smaller shells; less than a chunk
     for rows in np.split(by_shell, ends[:-1]):
         is_inner = _lowest(distances[rows], -len(remaining) % _CHUNK)
         remaining = np.concatenate([remaining, rows[is_inner]])
@@ -225,15 +225,15 @@ def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
 
 
 def _split(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the order (N,) in which each chunk contains neighbours."""
+    """Return an order (N,) in which each chunk contains neighbours."""
     depth = _core.num_halvings(-(-len(means) // _CHUNK), 1)
     order, _ = _core.median_split(means * _STEP_WEIGHTS, np.array([0, len(means)]), depth, _CHUNK)
     return np.asarray(order, np.int64)
 
 
 def _distances(means: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the distance (N,) of each position from the median position along the axis
-    on which it is largest."""
+    """Return the distance (N,) of each position from the median position, along the
+    axis on which this distance is largest."""
     positions = means.astype(np.float64)
     if not len(positions):
         return np.zeros(0)
@@ -241,8 +241,8 @@ def _distances(means: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _shells(distances: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the shell (N,) of each distance: 0 up to the radius of the inner shell,
-    and one more for each factor `_SHELL_GROWTH` of that radius."""
+    """Return the index (N,) of the shell of each distance. It is 0 up to the radius of
+    the inner shell, and rises by one with each factor `_SHELL_GROWTH`."""
     radius = 0.0
     if len(distances):
         radius = _INNER_FACTOR * float(np.quantile(distances, _INNER_SHARE))
@@ -254,8 +254,8 @@ def _shells(distances: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def _lowest(values: NDArray[np.floating], count: int) -> NDArray[np.bool_]:
-    """Return whether each value (N,) is among the ``count`` lowest, in order of value
-    and then of index; all are if there are no more."""
+    """Return whether each value (N,) is among the ``count`` lowest. Equal values are
+    ordered by index. If there are at most ``count`` values, all are."""
     if count >= len(values):
         return np.ones(len(values), bool)
     if count == 0:
@@ -286,7 +286,7 @@ def _header(host: Gaussians, num_chunks: int) -> bytes:
 
 
 # Each byte of SH stands for the middle of an interval, except that the first and the
-# last are the exact bounds.
+# last byte are the exact limits.
 _SH_VALUE = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
 _SH_VALUE[0] = -4.0
 _SH_VALUE[255] = 4.0
@@ -313,7 +313,7 @@ def _range_names(kind: str) -> list[str]:
 
 
 def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
-    """Return the kinds of ranges that the chunks of a file have; older files have none
+    """Return the kinds of ranges that the chunks of a file have. Older files have none
     for colours."""
     kinds = [kind for kind in _RANGES if kind != "color" or chunk.kinds.keys() & _range_names(kind)]
     for kind in kinds:
@@ -323,7 +323,7 @@ def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
 
 def _ranges(chunk: NDArray[np.void], kinds: Sequence[str]) -> dict[str, tuple[Floats, Floats]]:
     """Return, by kind, the minima and the maxima of each chunk, (C, 3) each. Colours
-    without ranges have 0 and 1."""
+    without ranges have the range from 0 to 1."""
     shape = (len(chunk), 3)
     ranges: dict[str, tuple[Floats, Floats]] = {"color": (np.zeros(shape), np.ones(shape))}
     for kind in kinds:

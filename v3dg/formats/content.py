@@ -14,7 +14,7 @@ _START_BYTES = ksplat.HEADER_BYTES
 _UNPACKED_BYTES = 64  # bytes of a gzip that are decompressed to recognise its content
 _MAX_ZIP_NAMES = 4096  # number of names in a zip that are examined
 
-# The suffix of the reader, by the first bytes of a file.
+# The suffix of the reader for a format, by the first bytes of a file.
 _BY_START = {
     b"ply\n": ".ply",
     b"ply\r": ".ply",
@@ -24,8 +24,8 @@ _BY_START = {
     b"PXR-USDC": ".usdc",
 }
 # First bytes, in lower case, of files that no reader supports, and descriptions of
-# these files. A `.splat` may begin with any bytes, so each entry is too long to occur
-# by chance.
+# these files. A `.splat` may begin with any bytes, so each entry is long enough not to
+# occur by chance.
 _NOT_READ = {
     b"version https://git-lfs": "a Git LFS pointer instead of the file; run git lfs pull",
     b"<!doctype html": "a web page; download the file itself",
@@ -46,9 +46,9 @@ class Content(NamedTuple):
     """The kind of a file.
 
     Attributes:
-        suffix: The suffix that selects the reader; empty if there is no reader.
-        text: A phrase for messages: what the file is and, if no reader supports it,
-            what to do.
+        suffix: The suffix that selects the reader, or an empty text if there is none.
+        text: A phrase for messages. It says what the file is and, if no reader supports
+            it, what to do.
     """
 
     suffix: str
@@ -56,13 +56,13 @@ class Content(NamedTuple):
 
 
 def content_of(path: AnyPath) -> Content | None:
-    """Return the kind of a file's content; None if the first bytes do not show it or
-    cannot be read.
+    """Return the kind of a file's content. Return None if the first bytes do not show
+    it or cannot be read.
 
-    A few kilobytes are read, and the list of names if the file is a zip.
+    A few kilobytes are read. For a zip, the list of names is read, too.
     """
     # The exceptions of zipfile and zlib for damaged content are not documented. After
-    # any of them, the reader for the file's name reports the problem.
+    # any of them, the reader for the file's name reports the error.
     with contextlib.suppress(Exception):
         with open(_files.open_regular(path), "rb") as file:
             num_bytes = os.fstat(file.fileno()).st_size

@@ -1,9 +1,9 @@
-"""glTF 2.0 with KHR_gaussian_splatting, `.glb` or `.gltf`: the gaussians are
+"""glTF 2.0 with KHR_gaussian_splatting, `.glb` or `.gltf`. The gaussians are
 attributes, or a compressed `.spz`.
 
 The writer writes one primitive. The reader reads all gaussians of a scene, placed by
-their nodes. Both convert between the axes in memory and those of glTF: left, up,
-forward.
+their nodes. Both convert between the axes in memory and those of glTF, which are left,
+up, forward.
 """
 
 import json
@@ -60,9 +60,9 @@ def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) ->
 
 
 def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
-    """Return the content of a `.glb` file. The gaussians are on the host, have the axes
-    of the file, and contain only values that the format can store. If compressed, the
-    file has the form of the draft that CesiumJS reads."""
+    """Return the content of a `.glb` file. The gaussians must be on the host, have the
+    axes of the file, and contain only values that the format can store. If compressed,
+    the file has the form of the draft that CesiumJS reads."""
     columns = _columns(host, compressed=compressed)
     if compressed:
         parts = [b"".join(spz.encode(host))]
@@ -76,8 +76,9 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
         accessors.append(_accessor(name, values, view))
     extension: JsonObject = {}
     if not compressed:
-        # With them, readers that follow the release would turn the `.spz`; CesiumJS,
-        # for which it is, never does.
+        # Compressed files lack these properties. With them, readers that implement the
+        # released extension would convert the axes of the `.spz`, but CesiumJS would
+        # not.
         extension |= {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     if host.antialiased is not None:
         extension["extras"] = {"antialiased": host.antialiased}
@@ -102,8 +103,8 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
 
 
 def _columns(host: Gaussians, *, compressed: bool) -> dict[str, NDArray[np.generic]]:
-    """Return the attributes of gaussians by name, (N, width); if compressed, only those
-    that are not in the `.spz`."""
+    """Return the attributes of gaussians by name, (N, width). If they are compressed,
+    return only those that are not in the `.spz`."""
     columns: dict[str, NDArray[np.generic]] = {
         "POSITION": host.means,
         f"{NAME}:SCALE": host.scales,
@@ -121,8 +122,8 @@ def _columns(host: Gaussians, *, compressed: bool) -> dict[str, NDArray[np.gener
 
 
 def _accessor(name: str, values: NDArray[np.generic], view: int | None) -> JsonObject:
-    """Return the accessor of an attribute. `view` is the index of its buffer view; None
-    for compressed gaussians."""
+    """Return the accessor of an attribute. `view` is the index of its buffer view, or
+    None for compressed gaussians."""
     kind = BYTE
     if values.dtype == np.float32:
         kind = FLOAT
@@ -148,7 +149,7 @@ def _buffer_views(parts: list[bytes], *, are_arrays: bool) -> list[JsonObject]:
     for part in parts:
         view: JsonObject = {"buffer": 0, "byteOffset": offset, "byteLength": len(part)}
         if are_arrays:
-            view["target"] = _ARRAY_BUFFER  # required by validators
+            view["target"] = _ARRAY_BUFFER  # validators require this
         views.append(view)
         offset += len(part)
     return views

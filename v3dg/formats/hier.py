@@ -1,9 +1,10 @@
-"""`.hier`, of Hierarchical 3DGS (H3DG): a tree of gaussians. Only the leaves are read.
+"""`.hier`, of Hierarchical 3DGS (H3DG), contains a tree of gaussians. Only the leaves
+are read.
 
-The number of gaussians is followed by their columns: positions, rotations w x y z, log
-scales, opacities and SH of degree 3. Then follow the number of nodes, the nodes, and
-boxes. If the number of gaussians is negative, everything except the positions is in
-half precision.
+The file begins with the number of gaussians. Their columns follow: positions, rotations
+w x y z, log scales, opacities and SH of degree 3. Then come the number of nodes, the
+nodes, and boxes. If the number of gaussians is negative, everything except the
+positions is in half precision.
 """
 
 import numpy as np
@@ -72,7 +73,7 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def _num_nodes(file: File, count: int, columns_end: int, node_bytes: int) -> int:
-    """Return the number of nodes, which follows the columns of the gaussians; raise
+    """Return the number of nodes, which follows the columns of the gaussians. Raise
     ValueError unless the file has the size that both numbers imply."""
     damaged = f"got a file of {file.num_bytes} bytes; the file is damaged, or no .hier file"
     least_bytes = columns_end + 4
@@ -86,8 +87,8 @@ def _num_nodes(file: File, count: int, columns_end: int, node_bytes: int) -> int
 
 
 def _leaves(path: AnyPath, nodes: NDArray[np.void], count: int) -> NDArray[np.int64]:
-    """Return the indices of the gaussians that are leaves, ascending and without
-    repetition."""
+    """Return the indices of the gaussians that are leaves, in ascending order and
+    without repetition."""
     has_leaves = nodes["leaves"] != 0
     first = nodes["start"][has_leaves].astype(np.int64)
     size = nodes["leaves"][has_leaves].astype(np.int64)

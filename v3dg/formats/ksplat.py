@@ -30,11 +30,11 @@ _USED_HEADER_BYTES = 44  # all following bytes are zero
 _MINOR = 1  # the newest version is 0.1
 _SECTION_BYTES = 1024
 _MAX_SECTIONS = 1 << 16
-# By compression level: the types of a mean's coordinates, of scales and quaternions,
-# and of higher SH.
+# For each compression level, the types of a mean's coordinates, of scales and
+# quaternions, and of higher SH.
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 _SH_RANGE = (-1.5, 1.5)  # used if the header has no range
-_DEFAULT_STEPS = 32767  # steps in half a side of a bucket
+_DEFAULT_STEPS = 32767  # number of steps in half a side of a bucket
 _SECTION = struct.Struct("<IIIIfH2xI4xIIH")
 
 
@@ -47,18 +47,18 @@ class _Section(NamedTuple):
     num_buckets: int
     bucket_side: float  # world units
     bucket_bytes: int
-    num_steps: int  # steps in half a side of a bucket; 0 means the default
+    num_steps: int  # number of steps in half a side of a bucket; 0 means the default
     num_full_buckets: int
     num_partial_buckets: int
     sh_degree: int
 
 
 class _Buckets(NamedTuple):
-    """The buckets of a section, for means that are stored relative to them."""
+    """The buckets of a section. Means are stored relative to them."""
 
     centers: NDArray[np.float32]  # (N, 3) centre of each gaussian's bucket
     step_world: float
-    num_steps: int  # steps in half a side of a bucket
+    num_steps: int  # number of steps in half a side of a bucket
 
 
 def open_file(path: AnyPath) -> AssetFile:
@@ -73,8 +73,8 @@ def open_file(path: AnyPath) -> AssetFile:
 
 def is_start_of_one(start: bytes) -> bool:
     """Return whether the first bytes of a file, at least `HEADER_BYTES`, are a header
-    of this format. The format has no magic number, so this requires plausible numbers
-    in the header, and zeros after them."""
+    of this format. The format has no magic number, so the numbers in the header must be
+    plausible, and the bytes after them must be zero."""
     if len(start) < HEADER_BYTES or any(start[_USED_HEADER_BYTES:HEADER_BYTES]):
         return False
     major, minor, most_sections, num_sections, _, _, compression = struct.unpack_from(
@@ -86,8 +86,8 @@ def is_start_of_one(start: bytes) -> bool:
 
 
 def _declared(start: bytes) -> Declared:
-    """Return a note if the header has a newer version, whose content may differ from
-    what this reader expects."""
+    """Return a note if the header has a newer version, because the content may then
+    differ from what this reader expects."""
     minor = start[1]
     if minor <= _MINOR:
         return NOTHING
@@ -115,7 +115,7 @@ def read(path: AnyPath) -> Gaussians:
 
 
 def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
-    """Return the headers of all sections, the SH degree and the compression level;
+    """Return the headers of all sections, the SH degree and the compression level.
     ``content`` is the beginning of a file, or all of it."""
     num_bytes = len(content)
     check(path, num_bytes >= HEADER_BYTES, f"a header of {HEADER_BYTES} bytes, got {num_bytes}")
@@ -206,7 +206,7 @@ def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _S
 def _decoded(
     records: NDArray[np.void], buckets: _Buckets | None, degree: int, sh_range: tuple[float, float]
 ) -> Gaussians:
-    """Return the gaussians of a section, whose coefficients are padded with zeros up to
+    """Return the gaussians of a section. Their coefficients are padded with zeros up to
     ``degree``."""
 
     def decode(block: slice) -> tuple[Floats, ...]:

@@ -20,13 +20,14 @@ PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 _Elements: TypeAlias = Sequence[tuple[str, int, Sequence[tuple[str, str]]]]
 
 _NORMALS = ("nx", "ny", "nz")  # the code of 3DGS writes zeros here
-# Floats up to this value count as colours of 0 to 1, larger ones as 0 to 255.
+# If no value is larger than this, floats are colours from 0 to 1, and otherwise colours
+# from 0 to 255.
 _MAX_COLOR = 8.0
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.ply` file. A file with packed positions is read as a `.compressed.ply`
-    file, whatever its name is."""
+    """Open a `.ply` file. If it has packed positions, it is read as a `.compressed.ply`
+    file, whatever its name."""
     name = os.fspath(path)
     _, _, elements = _core.ply_header(name)
     if any("packed_position" in dict(properties) for _, _, properties in elements):
@@ -57,7 +58,8 @@ def _declared(
     comments: Sequence[str], elements: _Elements, used: set[str], prefix: str
 ) -> Declared:
     """Return what a file declares, with notes about content that is ignored or
-    converted; ``used`` has the property names that are read, without their prefix."""
+    converted. ``used`` has the names of the properties that are read, without their
+    prefix."""
     by_comments = _ply_comments.declared_by(comments)
     vertex = next(properties for name, _, properties in elements if name == "vertex")
     names = [name.removeprefix(prefix) for name, _ in vertex]

@@ -1,10 +1,10 @@
 """SOG, of PlayCanvas: pictures with one pixel per gaussian, and a `meta.json`, in a zip
 (`.sog`) or a folder.
 
-In version 2, a position has 16 bits per coordinate, for sign(x) ln(1 + |x|). Log scales
-and colours are indices into tables of 256 values. A quaternion has three bytes and the
-index of its largest component, and an opacity one byte. Higher SH are an index into a
-palette of sets of coefficients. See docs/formats.md.
+In version 2, a position has 16 bits per coordinate, which encode sign(x) ln(1 + |x|).
+Log scales and colours are indices into tables of 256 values. A quaternion has three
+bytes and the index of its largest component, and an opacity one byte. Higher SH are an
+index into a palette of sets of coefficients. See docs/formats.md.
 """
 
 import io
@@ -40,8 +40,8 @@ from v3dg.gaussians import Gaussians
 
 _Pixels: TypeAlias = NDArray[np.uint8]
 _MAX_GAUSSIANS = 1 << 28  # number of pixels in the largest WebP
-# A picture may have more pixels than gaussians, because writers round its size up
-# differently: this many times the number, plus a constant.
+# A picture may have more pixels than gaussians, because writers round its size up in
+# different ways. The limit is this many times the number of gaussians, plus a constant.
 _MAX_PIXELS_FACTOR = 4
 _FREE_PIXELS = 1 << 16
 _LEAST_PALETTE = 1024
@@ -89,8 +89,8 @@ def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussian
 
 
 def _folder_in(path: Path, archive: Archive) -> str:
-    """Return the folder of a zip that contains meta.json, with a slash at the end; ""
-    if meta.json is not in a folder."""
+    """Return the folder of a zip that contains meta.json, with a slash at the end.
+    Return "" if meta.json is not in a folder."""
     names = [name for name in archive.names if not name.startswith(_RESOURCE_FORKS)]
     is_streamed = any(name.rsplit("/", 1)[-1] == "lod-meta.json" for name in names)
     advice = "unpack the zip and open lod-meta.json"
@@ -123,11 +123,11 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     count, degree = _size(meta)
     names = _names(meta)
     pictures = {name: load(name) for part in names.values() for name in part}
-    # All files are open now. Their total size limits the number of gaussians.
+    # All files are open now, and their total size limits the number of gaussians.
     claims.add(path, count)
 
     def pixels(name: str) -> _Pixels:
-        """Return (N, 4) red, green, blue and alpha of a picture: one pixel per
+        """Return (N, 4) red, green, blue and alpha of a picture with one pixel per
         gaussian."""
         return _decoded(path, name, pictures[name], count).reshape(-1, 4)[:count]
 
@@ -165,10 +165,10 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
 
 
 class _Palette(NamedTuple):
-    """The palette of higher SH; each gaussian has the label of an entry."""
+    """The palette of higher SH. Each gaussian has the label of an entry."""
 
     table: Floats  # (256,) values
-    # (P, K, 3) indices into the table; P is num_entries, rounded up to full rows of the
+    # (P, K, 3) indices into the table. P is num_entries, rounded up to full rows of the
     # picture.
     entries: _Pixels
     num_entries: int
@@ -210,8 +210,8 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
 
 
 def _declared(meta: dict[str, Node]) -> Declared:
-    """Return what meta.json declares. `antialias` is from the specification, `model`
-    from splat-transform; if a file has both, `model` counts."""
+    """Return what meta.json declares. The specification defines `antialias`, and
+    splat-transform writes `model`. If a file has both, `model` is used."""
     notes = []
     antialiased: bool | None = None
     if "antialias" in meta:
@@ -241,8 +241,8 @@ def _size(meta: dict[str, Node]) -> tuple[int, int]:
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
-    """Return the names of the pictures of each part. All must be in the folder of
-    meta.json."""
+    """Return the names of the pictures of each part. All of them must be in the folder
+    of meta.json."""
     names = {}
     for part, count in _PARTS.items():
         if part in meta:
@@ -274,7 +274,7 @@ def _decoded(
     path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None
 ) -> _Pixels:
     """Return the pixels (H, W, 4) of a picture. It must have at least ``num_pixels``
-    pixels and not many more, and the width ``row`` if that is not None."""
+    pixels, and not many more. If ``row`` is not None, it must be the width."""
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would also try other formats
 
     width, height = _size_of_webp(content)
@@ -296,8 +296,9 @@ def _decoded(
 
 
 def _size_of_webp(content: bytes) -> tuple[int, int]:
-    """Return the width and the height of a WebP picture from its first chunk, before a
-    decoder allocates memory for it; 0, 0 if the content is not WebP."""
+    """Return the width and the height of a WebP picture, before a decoder allocates
+    memory for it. They are in the first chunk. Return 0, 0 if the content is not
+    WebP."""
 
     def number(first: int, size: int) -> int:
         return int.from_bytes(content[first : first + size], "little")
@@ -314,15 +315,15 @@ def _size_of_webp(content: bytes) -> tuple[int, int]:
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> Gaussians:
     """Write a `.sog` file. Gaussians are reordered along a Morton curve, so that
-    neighbours in space are close in the file; returns them in this order."""
+    neighbours in space are close in the file. Return them in this order."""
     host = _packing.check_writable(gaussians)
     host = host.subset(_core.morton_order(host.means))
-    # All gaussians of a small asset, and many of a larger one, keep their own higher
-    # SH. Half the palette would halve its bytes but lose 5 to 30 dB.
+    # In a small asset, every gaussian keeps its own higher SH; in a larger one, many
+    # do. Half the palette would halve its bytes, but lose 5 to 30 dB.
     size = max(len(host) // 4, min(len(host), _FULL_PALETTE))
     contents = encode(host, palette_size=size)
-    # Readers reject files that are too small for the number of their gaussians, and
-    # equal gaussians compress to almost nothing.
+    # Readers reject files that are too small for their number of gaussians, and equal
+    # gaussians compress to almost nothing, so the file may need padding.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
     if missing > 0:
         contents["padding"] = bytes(missing)
@@ -335,12 +336,12 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> Gaussians:
 
 def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str, bytes]:
     """Return the content of the files of a SOG, by name. ``gaussians`` must have passed
-    `check_writable`; their order is kept.
+    `check_writable`. Their order is kept.
 
     Args:
-        palette_size: Number of sets of higher SH; at most 65,536 are used. None means a
-            quarter of the number of gaussians, but at least 1024, which suits small
-            files that are downloaded.
+        palette_size: Number of sets of higher SH, of which at most 65,536 are used.
+            None means a quarter of the number of gaussians, but at least 1024. This
+            suits small files for downloading.
     """
     count = len(gaussians)
     width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
@@ -452,6 +453,6 @@ def _webp(values: _packing.Integers, width: int, height: int) -> bytes:
     pixels = np.full((height, width, 4), 255, np.uint8)
     pixels.reshape(-1, 4)[: len(values), : values.shape[1]] = values
     stream = io.BytesIO()
-    # `exact` keeps the colours of pixels whose alpha is 0.
+    # With `exact`, pixels with an alpha of 0 keep their colours.
     Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)
     return stream.getvalue()

@@ -15,13 +15,13 @@ from v3dg.rotations import normalised
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
-# Accepted lengths of a unit quaternion, in steps of its bytes.
+# Lengths of a unit quaternion, in steps of its bytes, that are accepted.
 _QUATERNION_LENGTHS = (124.0, 132.0)
-_LARGEST = 1e9  # assets have no larger coordinates and scales
+_LARGEST = 1e9  # no asset has larger coordinates or scales
 
 
 def is_start_of_one(start: bytes, num_bytes: int) -> bool:
-    """Return whether a file of this length with these first bytes is a `.splat`: the
+    """Return whether a file of this length with these first bytes is a `.splat`. The
     bytes must be records with unit quaternions and plausible numbers."""
     num_records = len(start) // _RECORD.itemsize
     if num_bytes % _RECORD.itemsize or not num_records:

@@ -1,10 +1,11 @@
 """`.spz`, of Niantic: about 20 bytes per gaussian before compression, with fixed-point
 positions.
 
-Versions 1 to 3 are one gzip stream: a header of 16 bytes, then positions, opacities,
-colours, scales, rotations and higher SH, each for all gaussians. Version 4 has a header
-of 32 bytes, a table of sizes, and one zstd stream for each attribute. Version 1 stores
-positions in half precision; versions 1 and 2 store quaternions without w.
+Versions 1 to 3 are one gzip stream. It has a header of 16 bytes, then positions,
+opacities, colours, scales, rotations and higher SH, each for all gaussians. Version 4
+has a header of 32 bytes, a table of sizes, and one zstd stream for each attribute.
+Version 1 stores positions in half precision. Versions 1 and 2 store quaternions without
+w.
 
 The axes are right, up, back, unless the extension SPZ_ADOBE_coordinate_system declares
 others. Some programs store the axes of `.ply` without declaring them. If the gaussians
@@ -44,9 +45,10 @@ _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
 MAX_START = 1 << 16
-"""Number of bytes at the beginning of a file that always contain the header, even after
-the optional fields of a gzip header."""
-_MAX_TRAILER = 1 << 20  # bytes for extensions of vendors, after the attributes
+"""The header is always within this number of bytes from the start of the file, even
+after the optional fields of a gzip header."""
+# maximum size of the extensions of vendors, which follow the attributes
+_MAX_TRAILER = 1 << 20
 _COLOR_SCALE = 0.15
 _MAX_DEGREE = 3  # coefficients of degree 4 are dropped
 _LARGEST_FIXED = (1 << 23) - 1
@@ -63,7 +65,7 @@ _AXES = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
 )
-# The axes of files by programs that store gaussians unchanged, by the axis that points
+# The axes in files of programs that store gaussians unchanged, by the axis that points
 # up.
 _STORED_AXES: dict[Axis, str] = {"y": _axes.OPENGL, "-y": _axes.MEMORY, "z": _axes.Z_UP}
 
@@ -73,16 +75,16 @@ LIMITS = _packing.Limits(
     color=(-0.5 / _COLOR_SCALE, 0.5 / _COLOR_SCALE),
     harmonic=(-1.0, 127.5 / 128),
 )
-"""The ranges of values in the format, extended by half a step where values beyond the
-range are rounded into it."""
+"""The ranges of values in the format. They are extended by half a step if values beyond
+the range are rounded into it."""
 
 
 class Header(NamedTuple):
     """The header of a file."""
 
     version: int
-    stored_degree: int  # of spherical harmonics, 0 to 4
-    fraction_bits: int  # fraction bits of the fixed-point positions
+    stored_degree: int  # degree of the spherical harmonics, 0 to 4
+    fraction_bits: int  # number of fraction bits of the fixed-point positions
     num_gaussians: int
     flags: int
 
@@ -147,8 +149,9 @@ def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Heade
 
 
 def decode(path: AnyPath, content: bytes, claims: Claims, axes: str, target: str) -> Gaussians:
-    """Return the gaussians of a `.spz` file with this content in the axes ``target``.
-    The file has the axes that it records; without a record, it has ``axes``."""
+    """Return the gaussians of a `.spz` file with this content, converted to the axes
+    ``target``. The file has the axes that it records. Without a record, it has
+    ``axes``."""
     expanded = _expanded(path, content, claims)
     return _axes.turned(_decode(expanded), _recorded_axes(path, expanded) or axes, target)
 
@@ -167,23 +170,23 @@ def write(
     path: AnyPath, gaussians: Gaussians, version: int = 3, *, up: Axis = _axes.MEMORY_UP
 ) -> Gaussians:
     """Write a `.spz` file of version 2, 3 or 4, in the order of the gaussians. `up` is
-    the axis of the gaussians that points up. Returns the gaussians on the host, in
-    their own axes."""
+    the axis of the gaussians that points up. Return the gaussians of the file on the
+    host, in the original axes."""
     check("version", version in (2, 3, 4), f"2, 3 or 4 for a .spz file, got {version}")
     written = _packing.check_writable(gaussians)
     host = _axes.turned(written, _axes.axes_of_up(up), _axes.OPENGL)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         for part in encode(host, version, axes=_axes.OPENGL):
             file.write(part)
-        # Readers reject files that are too small for the number of their gaussians, and
+        # Readers reject files that are too small for their number of gaussians, and
         # ignore zeros at the end.
         file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
     return written
 
 
 def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[bytes]:
-    """Yield the parts of a `.spz` file. ``host`` must have passed `check_writable`. The
-    file declares its axes if ``axes`` is not empty."""
+    """Yield the parts of a `.spz` file. ``host`` must have passed `check_writable`. If
+    ``axes`` is not empty, the file declares these axes."""
     bits = _fraction_bits(host.means)
 
     def fixed(rows: slice) -> bytes:
@@ -224,8 +227,8 @@ def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[byt
 
 
 def _fraction_bits(means: NDArray[np.float32]) -> int:
-    """Return the number of fraction bits: 12, as in Niantic's writer, or more if one
-    step would exceed 2^-17 of the largest coordinate."""
+    """Return the number of fraction bits. It is 12, as in Niantic's writer, or more if
+    one step would exceed 2^-17 of the largest coordinate."""
     reach = float(np.abs(means).max(initial=0.0))
     integer_bits = 0
     if reach > 0:
@@ -240,7 +243,7 @@ def _zstd_parts(
     header: bytes, extensions: bytes, count: int, sections: list[Callable[[slice], bytes]]
 ) -> Iterator[bytes]:
     """Yield the header, which contains the number of streams and the offset of their
-    table, then the extensions, the table of sizes, and the streams."""
+    table. Then yield the extensions, the table of sizes, and the streams."""
     import zstandard
 
     raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
@@ -257,11 +260,12 @@ def _bytes(values: Floats) -> bytes:
 
 
 def _rotation_bytes(quats: Floats) -> bytes:
-    """Return the components x y z as bytes, after negating quaternions whose w is
-    negative.
+    """Return the components x y z as bytes. Quaternions with a negative w are negated
+    first.
 
-    Readers derive w, which depends strongly on the bytes if it is small. So each
-    component is rounded up or down such that the rotation is as close as possible.
+    Readers compute w from the other components. If w is small, it depends strongly on
+    the bytes. Therefore each component is rounded up or down such that the rotation is
+    as close as possible.
     """
     unit = normalised(quats)
     unit = unit * np.where(unit[:, :1] < 0, -1.0, 1.0)
@@ -297,8 +301,7 @@ def _means(content: _Content, rows: slice) -> Floats:
 
 
 class _StoredAxes(NamedTuple):
-    """The axes of the stored gaussians, and the source of that knowledge as a
-    phrase."""
+    """The axes of the stored gaussians, and how they were determined, as a phrase."""
 
     axes: str
     reason: str
@@ -318,7 +321,7 @@ def _axes_of(path: AnyPath, content: _Content) -> _StoredAxes:
 
 
 def _recorded_axes(path: AnyPath, content: _Content) -> str:
-    """Return the axes that a file records; empty without a record."""
+    """Return the axes that a file records. Without a record, return an empty text."""
     for kind, payload in _records(content.extensions):
         if kind == _AXES_EXTENSION:
             number = int.from_bytes(payload, "little")
@@ -421,10 +424,10 @@ def _sections_of_gzip(path: AnyPath, content: bytes, claims: Claims) -> _Content
     sizes = header.section_bytes
     total = sum(sizes)
     with value_errors(path, "a gzip stream that is not damaged"):
-        # A limit of 0 would mean no limit; this one is always positive.
+        # A limit of 0 would mean no limit, but this one is always positive.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
-            # One more byte is requested, so that the checksum is read if nothing else
+            # One more byte is requested, so that the checksum is read even if nothing
             # follows.
             stream.decompress(stream.unconsumed_tail, 1)
     is_whole = len(body) >= total and stream.eof

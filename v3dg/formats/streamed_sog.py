@@ -1,8 +1,8 @@
 """Streamed SOG, of PlayCanvas: `lod-meta.json` and folders with a SOG each. v3dg.export
 writes this format.
 
-`lod-meta.json` has a tree of boxes. Each leaf lists, for each level of detail, the rows
-of gaussians in one of the folders that represent the content of its box.
+`lod-meta.json` has a tree of boxes. Each leaf lists, for each level of detail, rows of
+gaussians in one of the folders. They represent the content of the leaf's box.
 """
 
 import os
@@ -45,7 +45,8 @@ class _Index(NamedTuple):
 
     tree: Node
     names: list[PurePosixPath]  # the files that the tree refers to by index
-    environment: PurePosixPath | None  # the file of gaussians that belong to no leaf
+    # the file with the gaussians that belong to no leaf
+    environment: PurePosixPath | None
     unread: list[str]  # names of ignored fields
 
 
@@ -102,7 +103,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def files(path: Path) -> list[Path]:
-    """Return the index and those files of all levels and of the environment that
+    """Return the index, and those files of all levels and of the environment that
     exist."""
     index = _index(path, Claims())
     names = dict.fromkeys([*index.names, index.environment])
@@ -134,7 +135,7 @@ def _index(path: Path, claims: Claims) -> _Index:
 
 
 def _inside(node: Node) -> PurePosixPath:
-    """Return the path of a file in the folder of the index or below it; raise
+    """Return the path of a file in the folder of the index, or below it. Raise
     ValueError for other paths."""
     path = PurePosixPath(node.text())
     if path.is_absolute() or ".." in path.parts or "\\" in node.text():
@@ -146,8 +147,8 @@ def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[
     """Return, for each file, the rows of gaussians that are the finest level of a
     leaf."""
     runs: dict[PurePosixPath, list[range]] = {}
-    # A list of a million empty nodes would need as much memory as a scene, so iterators
-    # are stacked.
+    # A list of a million empty nodes would need as much memory as a scene, so a stack
+    # of iterators is used.
     todo = [iter([tree])]
     while todo:
         node = next(todo[-1], None)

@@ -4,7 +4,7 @@ The writer writes one prim. The reader reads and transforms all prims, into one 
 or, for a scene, into several assets with the poses of their instances. It reads the
 first of several levels of detail, and the first of values that change with time. It
 ignores prims that are invisible or not meant to be drawn. An asset is converted from
-the axes of the stage to those in memory; a scene keeps the axes of the stage.
+the axes of the stage to those in memory. A scene keeps the axes of the stage.
 
 Source: Pixar, OpenUSD 26.11, the schemas of UsdVol, and Usdz File Format Specification.
 """
@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-# The axes of a stage by its up axis; the cameras of a stage look along -z.
+# The axes of a stage, by its up axis. The cameras of a stage look along -z.
 _AXES = {"Y": _axes.OPENGL, "Z": _axes.Z_UP}
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
-# The custom data of a prim for antialiasing, because the schema has no attribute for
+# The custom data of a prim that declares antialiasing. The schema has no attribute for
 # it.
 _ANTIALIASED = "antialiased"
 _SH = "radiance:sphericalHarmonics"
@@ -64,7 +64,7 @@ _HINTS = ("projectionModeHint", "sortingModeHint")
 _COLOR_SPACE = "colorSpace:name"
 _KNOWN = (*_COLUMNS, *_HINTS, _COLOR_SPACE, "extent", "visibility", "purpose", "xformOpOrder")
 # Names of colour spaces of UsdColorSpaceAPI, those of glTF, and shorter ones of
-# MaterialX. Colours in sRGB, or without a colour space, are read as they are.
+# MaterialX. Colours in sRGB, or without a colour space, are not converted.
 _WRITTEN_COLOR_SPACE = "srgb_rec709_scene"
 _SRGB = ("", _WRITTEN_COLOR_SPACE, "srgb_rec709_display", "srgb_texture", "raw", "data", "unknown")
 _LINEAR = ("lin_rec709_scene", "lin_rec709_display", "lin_rec709")
@@ -80,8 +80,8 @@ class _Kernel(Enum):
 
 
 class _Column(NamedTuple):
-    """The values of an attribute for the particles of a prim; None if the default of
-    the schema applies."""
+    """The values of an attribute for the particles of a prim. It is None if the default
+    of the schema applies."""
 
     values: NDArray[np.float32] | None
     note: str = ""
@@ -89,7 +89,7 @@ class _Column(NamedTuple):
 
 @cache
 def pxr() -> ModuleType:
-    """Return the package `pxr`; if it is missing, the ImportError says how to install
+    """Return the package `pxr`. If it is missing, the ImportError says how to install
     it."""
     for part in (
         "Usd",
@@ -105,7 +105,7 @@ def pxr() -> ModuleType:
 
 
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a USD file. All of it is read at once."""
+    """Open a USD file. All of it is read immediately."""
     gaussians, declared = read(path)
 
     def read_rows(first: int, last: int) -> Gaussians:
@@ -138,7 +138,7 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
 
 
 def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) -> Declared:
-    """Return what a stage declares, together with the notes about its prims; `letter`
+    """Return what a stage declares, together with the notes about its prims. `letter`
     is the stage's up axis."""
     unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
     distinct = list(dict.fromkeys(notes))
@@ -161,8 +161,8 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
     """Read a USD file as a scene: its distinct assets, the asset and the pose of each
     instance, and the up axis.
 
-    Prims whose values come from the same place in the file are one asset, for example
-    references to one prim.
+    Prims whose values come from the same place in the file are one asset. References to
+    one prim are an example.
     """
     asset_from_path: dict[Sdf.Path, int] = {}
     asset_from_source: dict[tuple[object, ...], int] = {}
@@ -210,7 +210,7 @@ def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim
 
 def _check_package(path: AnyPath) -> None:
     """Raise ValueError unless a file is a zip that begins with a USD layer and whose
-    members are all uncompressed: the library reads them in place."""
+    members are all uncompressed. The library reads them in place."""
     with value_errors(path, "a .usdz, which is a zip"), zipfile.ZipFile(path) as package:
         members = package.infolist()
     is_layer = bool(members) and members[0].filename.endswith(SUFFIXES[:3])
@@ -224,13 +224,13 @@ def _check_package(path: AnyPath) -> None:
 
 
 def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
-    """Yield all prims of gaussians and all instancers at or below a root that are meant
-    to be drawn; coarser levels of detail are skipped."""
+    """Yield the prims of gaussians and the instancers at or below a root, if they are
+    meant to be drawn. Coarser levels of detail are skipped."""
     walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
     for prim in walk:
         is_instancer = prim.IsA(usd.UsdGeom.PointInstancer)
         is_left_out = _is_coarse(usd, prim) or _is_hidden(usd, prim)
-        # Prims below an instancer are drawn only as its instances.
+        # Prims below an instancer are only drawn as its instances.
         if is_instancer or is_left_out:
             walk.PruneChildren()
         if not is_left_out and (is_instancer or _kernel(usd, prim) is not None):
@@ -244,8 +244,8 @@ def _is_coarse(usd: ModuleType, prim: Usd.Prim) -> bool:
 
 
 def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
-    """Return whether a prim and everything below it are not drawn: invisible prims,
-    proxies, and guides for editing."""
+    """Return whether a prim and everything below it are not drawn. This is the case for
+    invisible prims, proxies, and guides for editing."""
     imageable = usd.UsdGeom.Imageable(prim)
     if not imageable:
         return False
@@ -256,7 +256,7 @@ def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
 
 
 def _kernel(usd: ModuleType, prim: Usd.Prim) -> _Kernel | None:
-    """Return the shape of a prim's particles; None if the particles are not
+    """Return the shape of a prim's particles. Return None if the particles are not
     gaussians."""
     if prim.IsA(usd.UsdVol.ParticleField):
         for kernel in _Kernel:
@@ -295,9 +295,8 @@ def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
 
 
 def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]]:
-    """Yield each prim of gaussians with a (4, 4) matrix from the coordinates of the
-    prim to those of the root. A prim with instances is yielded once for each
-    instance."""
+    """Yield each prim of gaussians with a (4, 4) matrix from its coordinates to those
+    of the root. A prim with instances is yielded once for each instance."""
     root_from_world = np.linalg.inv(_to_world(usd, root))
     time = usd.Usd.TimeCode.EarliestTime()
     for prim in _prims(usd, root):
@@ -326,7 +325,7 @@ def _to_world(usd: ModuleType, prim: Usd.Prim) -> Floats:
 
 def _similarity(prim: Usd.Prim, matrix: Floats) -> _Pose:
     """Return the quaternion, the translation and the scale of a (4, 4) matrix that
-    places a prim; raise ValueError for other transforms."""
+    places a prim. Raise ValueError for other transforms."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
         raise ValueError(
@@ -350,7 +349,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
     harmonics = _column(usd, prim, f"{_SH}Coefficients", count * (degree + 1) ** 2)
     notes = [column.note for column in (*columns.values(), harmonics) if column.note]
     notes += _notes_of(usd, prim)
-    # Absent or ignored attributes have the defaults of the schema.
+    # Attributes that are absent or ignored have the defaults of the schema.
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
     if columns["orientations"].values is not None:
         quats = np.roll(columns["orientations"].values, 1, axis=1)
@@ -394,9 +393,9 @@ def _in_srgb(prim: Usd.Prim, gaussians: Gaussians, notes: list[str]) -> Gaussian
 
 
 def _color_space(prim: Usd.Prim) -> str:
-    """Return the name of the colour space of a prim's coefficients; empty if nothing
-    declares one. The attribute's own metadata is stronger than UsdColorSpaceAPI on the
-    prim, which is stronger than on its ancestors."""
+    """Return the name of the colour space of a prim's coefficients. If nothing declares
+    one, it is empty. The metadata of the attribute take precedence over
+    UsdColorSpaceAPI on the prim, which takes precedence over its ancestors."""
     for name in (f"{_SH}Coefficients", f"{_SH}Coefficientsh"):
         attribute = prim.GetAttribute(name)
         if attribute and attribute.HasColorSpace():
@@ -417,9 +416,9 @@ def _antialiased(prim: Usd.Prim) -> bool | None:
 
 
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
-    """Return the SH degree of a prim; the default of the schema is 3."""
+    """Return the SH degree of a prim. The default of the schema is 3."""
     degree = _value(usd, prim, f"{_SH}Degree")
-    if degree is None:  # a prim without a degree has no coefficients, either
+    if degree is None:  # a prim without a degree has no coefficients
         return 0
     if not isinstance(degree, int) or not 0 <= degree <= _MOST_DEGREE:
         raise ValueError(f"an invalid SH degree, {degree}, in {prim.GetPath()}")
@@ -428,8 +427,8 @@ def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
 
 def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _Column:
     """Return the first `count` values of an attribute in single precision or, if it is
-    missing, of its variant in half precision. The schema ignores an attribute with
-    fewer values."""
+    missing, of its variant in half precision. If an attribute has fewer values, the
+    schema ignores it."""
     stored = _value(usd, prim, name)
     if stored is None:
         stored = _value(usd, prim, f"{name}h")
@@ -445,7 +444,7 @@ def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _C
 
 
 def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
-    """Return the first value of an attribute; None if the prim does not have the
+    """Return the first value of an attribute. Return None if the prim does not have the
     attribute or a value for it."""
     attribute = prim.GetAttribute(name)
     if not attribute:
@@ -487,7 +486,7 @@ def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) ->
 
 
 def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
-    """Return an empty stage in metres; `up` is the axis that points up."""
+    """Return an empty stage in metres. `up` is the axis that points up."""
     usd = pxr()
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, up)
@@ -496,7 +495,7 @@ def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
 
 
 def export(stage: Usd.Stage, path: AnyPath) -> None:
-    """Write a stage to a file, which appears only when it is complete. The suffix
+    """Write a stage to a file. The file appears only when it is complete. The suffix
     selects the encoding."""
     with _files.replacing(path) as temporary, tempfile.TemporaryDirectory() as folder:
         # USD chooses the encoding by the suffix of the file.
@@ -517,7 +516,7 @@ def export(stage: Usd.Stage, path: AnyPath) -> None:
 
 
 def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
-    """Define a prim of gaussians on a stage; ``host`` must have passed
+    """Define a prim of gaussians on a stage. ``host`` must have passed
     `check_writable`."""
     usd = pxr()
     prim = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, path).GetPrim()
@@ -540,8 +539,8 @@ def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
-    # Without these a reader that goes by primvars takes one coefficient for each
-    # gaussian; NVIDIA's requirement VG.035 asks for both.
+    # Without these, a reader that uses primvars would take one coefficient for each
+    # gaussian. NVIDIA's requirement VG.035 demands both.
     harmonics = usd.UsdGeom.Primvar(prim.GetAttribute(f"{_SH}Coefficients"))
     harmonics.SetInterpolation(usd.UsdGeom.Tokens.vertex)
     harmonics.SetElementSize((host.sh_degree + 1) ** 2)

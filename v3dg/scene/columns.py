@@ -37,7 +37,7 @@ class Columns(NamedTuple):
 
 UNLABELLED = -1
 MOST_LABEL = (1 << 31) - 1
-SHARED = -1  # as an instance's environment: all cameras see it
+SHARED = -1  # the environment of instances that all cameras see
 MOST_ENVIRONMENT = (1 << 24) - 1
 _ROW = {
     "positions": (3,),
@@ -69,7 +69,7 @@ def columns_of(
     environment: npt.ArrayLike,
     label: npt.ArrayLike,
 ) -> Columns:
-    """Return checked columns; the number of positions is the number of instances."""
+    """Return checked columns. The number of positions is the number of instances."""
     points = _points_of(positions)
     count = len(points)
     return Columns(
@@ -104,8 +104,7 @@ def composed(outer: Columns, inner: Columns) -> Columns:
 
 
 def _points_of(positions: Array | npt.ArrayLike | None) -> Array:
-    """Return positions (I, 3). A single position may be passed as (3,); None means the
-    origin."""
+    """Return positions (I, 3). A single position may be (3,). None means the origin."""
     points: Array = positions
     if positions is None:
         points = (0.0, 0.0, 0.0)
@@ -119,8 +118,8 @@ def _points_of(positions: Array | npt.ArrayLike | None) -> Array:
 
 
 def parts_of(matrix: Array | npt.ArrayLike, *parts: Array | npt.ArrayLike | None) -> Similarity:
-    """Return the positions, quaternions and scales of matrices; raise ValueError if
-    these are also passed separately."""
+    """Return the positions, quaternions and scales of matrices. Raise ValueError if any
+    of these is also passed."""
     if any(part is not None for part in parts):
         raise ValueError(
             "matrix: cannot be combined with positions, quaternions or scales; pass only one of "
@@ -139,8 +138,8 @@ def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
 
 
 def up_of_bundle(bundle: Bundle) -> Axis:
-    """Return the axis of a bundle that points up: the one declared in its file, else
-    -y, as in most trained assets."""
+    """Return the axis of a bundle that points up. If its file does not declare one, it
+    is -y, as in most trained assets."""
     recorded = bundle.config.get("up")
     if recorded in AXES:
         return cast(Axis, recorded)
@@ -148,8 +147,8 @@ def up_of_bundle(bundle: Bundle) -> Axis:
 
 
 def column(values: Array | None, name: str, count: int) -> Array:
-    """Return a contiguous copy (count, ...) of a column, or of its default if `values`
-    is None. A single row applies to all instances, except for positions."""
+    """Return a contiguous copy (count, ...) of a column. If `values` is None, return
+    its default. Except for positions, a single row applies to all instances."""
     source: Array = values
     if values is None:
         source = _DEFAULTS.get(name)
@@ -186,12 +185,18 @@ def column(values: Array | None, name: str, count: int) -> Array:
 
 
 def environment_column(values: npt.ArrayLike, count: int) -> npt.NDArray[np.int32]:
-    """Return the environments (count,) of instances; a single one stands for all."""
+    """Return the environments (count,) of instances.
+
+    A single number applies to all of them.
+    """
     return _whole_column(values, "environment", count, SHARED, MOST_ENVIRONMENT)
 
 
 def label_column(values: npt.ArrayLike, count: int) -> npt.NDArray[np.int32]:
-    """Return the labels (count,) of instances; a single one stands for all."""
+    """Return the labels (count,) of instances.
+
+    A single number applies to all of them.
+    """
     return _whole_column(values, "label", count, UNLABELLED, MOST_LABEL)
 
 
@@ -209,8 +214,8 @@ def _whole_column(
 
 
 def on_device_of(array: Array, values: Array) -> Array:
-    """Return the values as a tensor on the device of ``array``; return them unchanged
-    if ``array`` is a NumPy array."""
+    """Return the values as a tensor on the device of ``array``. If ``array`` is a NumPy
+    array, return them unchanged."""
     if isinstance(array, np.ndarray):
         return values
     import torch
@@ -221,8 +226,8 @@ def on_device_of(array: Array, values: Array) -> Array:
 
 
 def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
-    """Return both arrays on the device of the one that is a tensor; on the host if both
-    are NumPy arrays."""
+    """If one of two arrays is a tensor, return both on its device. If both are NumPy
+    arrays, return both on the host."""
     target = first
     if isinstance(first, np.ndarray):
         target = second
@@ -230,8 +235,8 @@ def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
 
 
 def joined(first: Array, second: Array) -> Array:
-    """Return the concatenation of two arrays, on the device if either of them is
-    there."""
+    """Return the concatenation of two arrays. If either of them is on a device, the
+    result is on it."""
     first, second = _on_one_device(first, second)
     return _device.library_of(first).concatenate([first, second])
 
@@ -251,7 +256,7 @@ def replaced(values: Array, rows: Array, row_values: Array) -> Array:
 
 def _replaced_on_device(values: Array, rows: Array, row_values: Array) -> Array:
     """Do the work of `replaced` without waiting for the device. Rows that do not exist
-    are ignored: they go to a row behind the last one."""
+    are ignored, by writing them to an extra last row."""
     import torch
 
     count = len(values)

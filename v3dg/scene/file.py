@@ -28,7 +28,7 @@ VERSION = 1
 _Subject = TypeVar("_Subject", Bundle, Scene)
 
 
-# Limits for nested scenes: in a chain of files, each may place the next one many times.
+# Limits for nested scenes. In a chain of files, each may place the next one many times.
 _MOST_DEPTH = 16
 _MOST_INSTANCES = 1 << 24
 
@@ -36,8 +36,8 @@ _MOST_INSTANCES = 1 << 24
 class _Instance(NamedTuple):
     """A bundle or a nested scene with its pose and factors, as for `Scene.add`.
 
-    `node` is the place in the file, for messages. It is None for bundles, to save
-    memory.
+    `node` is the place in the file, for messages. To save memory, it is None for
+    bundles.
     """
 
     subject: Bundle | Scene
@@ -53,8 +53,8 @@ class _Instance(NamedTuple):
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a file has the name of a scene: a .json that is not the
-    `meta.json` of an asset in SOG."""
+    """Return whether a file has the name of a scene. This is any .json except
+    `meta.json`, which belongs to an asset in SOG."""
     name = beside(path).name
     return name.endswith(".json") and not name.endswith(SUFFIXES)
 
@@ -70,7 +70,7 @@ def read_scene(
     Args:
         bundles: Bundles that are already open, by their path in the file (in a
             published layout, by the name of the asset). Paths of all other bundles are
-            relative to the folder of the scene's file.
+            relative to the folder of the scene file.
 
     Raises:
         ValueError: The content is invalid; the message names the place in the file.
@@ -91,8 +91,7 @@ class _Files:
         self._chain: list[str] = []
 
     def read(self, path: Path, opened: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
-        """Return a scene and its cameras, using the bundles in `opened` that are
-        already open."""
+        """Return a scene and its cameras. Bundles in `opened` are not opened again."""
         root = read_json(path)
         self._chain.append(os.path.realpath(path))
         if root.has("layouts"):
@@ -126,7 +125,7 @@ class _Files:
     def open_bundles(
         self, nodes: Mapping[str, Node], folder: Path, opened: dict[str, Bundle]
     ) -> dict[str, Bundle]:
-        """Return bundles by name, using those that are already open."""
+        """Return bundles by name. Those that are already open are not opened again."""
         real_paths = {
             node.text(): os.path.realpath(folder / node.text()) for node in nodes.values()
         }
@@ -152,7 +151,7 @@ def write_scene(
 
     Args:
         bundle_paths: A path for each of ``scene.bundles``, relative to the folder of
-            the new file; None uses the files from which they were opened.
+            the new file. None uses the files from which they were opened.
 
     Raises:
         ValueError: The number of paths is wrong; a bundle was not opened from a file
@@ -201,7 +200,7 @@ def _camera_as_json(name: str, camera: Camera) -> dict[str, object]:
 
 
 def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
-    """Return the files from which the bundles were opened, relative to a folder; raise
+    """Return the files from which the bundles were opened, relative to a folder. Raise
     ValueError for a bundle without a local file."""
     paths = []
     for number, bundle in enumerate(scene.bundles):
@@ -213,7 +212,7 @@ def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
 
 
 def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]]:
-    """Return the instances of a scene as JSON values; `names` are the names of its
+    """Return the instances of a scene as JSON values. `names` has the names of its
     bundles."""
     bundles = scene.instance_bundle.tolist()
     positions = scene.positions.tolist()
@@ -288,8 +287,8 @@ _FACTORS = ("importance", "opacity", "tint", "environment", "label")
 
 
 def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
-    """Return an instance in a scene file. If it has the field `up`, the up axis of the
-    scene is set to that axis."""
+    """Return an instance in a scene file. If it has the field `up`, this sets the up
+    axis of the scene."""
     fields = node.fields((), ("bundle", "scene", *_POSE, "matrix", "up", *_FACTORS))
     if ("bundle" in fields) == ("scene" in fields):
         raise node.error("exactly one of the fields bundle and scene")
@@ -323,7 +322,7 @@ def _named(node: Node, subjects: Mapping[str, _Subject], kind: str) -> _Subject:
 
 def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
     """Add instances to a scene, in the order of the file. Neighbouring instances of
-    bundles are added in one step."""
+    bundles are added together."""
     for is_nested, run in itertools.groupby(instances, lambda i: isinstance(i.subject, Scene)):
         if not is_nested:
             _add_bundles(scene, list(run))
@@ -426,7 +425,7 @@ def _opacity(node: Node) -> float:
 
 
 def _whole(fields: Mapping[str, Node], name: str, low: int, high: int) -> int:
-    """Return a whole number from `low`, the default, to `high`."""
+    """Return an integer from `low`, which is the default, to `high`."""
     if name not in fields:
         return low
     node = fields[name]
@@ -562,8 +561,8 @@ def _read_flat_layout(
 
 
 def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[str, Camera]:
-    """Return cameras in Blender's convention, by name. If a name occurs twice, all
-    names are prefixed with the camera's number."""
+    """Return cameras in Blender's convention, by name. If a name occurs twice, the
+    camera's number is put in front of all names."""
     names = []
     cameras = []
     for node in nodes:
@@ -588,7 +587,7 @@ def _open_bundles(
     candidates: dict[str, tuple[Node, list[str]]], folder: Path, opened: dict[str, Bundle]
 ) -> None:
     """Add bundles to ``opened``. `candidates` has, for each key, possible paths
-    relative to the folder; the first existing one is opened."""
+    relative to the folder. The first one that exists is opened."""
     files: dict[str, Path] = {}
     for key, (node, names) in candidates.items():
         if key in opened:

@@ -58,13 +58,13 @@ class Scene:
     """A set of instances of bundles. Each bundle is stored once. An instance transforms
     its points p to scale * rotation p + position.
 
-    Instances are numbered from 0 in the order in which they were added; after `remove`,
+    Instances are numbered from 0 in the order in which they were added. After `remove`,
     the remaining ones are renumbered. Changes are visible in the next picture. Several
-    threads may change and draw a scene; each change is atomic. A copy of a scene has
-    the same bundles, and later changes of either scene do not affect the other.
+    threads may change and draw a scene, and each change is atomic. A copy of a scene
+    has the same bundles, but later changes of either scene do not affect the other.
 
     Poses may be NumPy arrays, or torch tensors on the host or on a CUDA device. Poses
-    on a device stay there, and their values are not checked: an instance is not drawn
+    on a device stay there, and their values are not checked. An instance is not drawn
     if its pose is not finite or its scale is not positive.
     """
 
@@ -135,13 +135,13 @@ class Scene:
         """Add I instances of a bundle and return their ids.
 
         Args:
-            bundle: A bundle or the path of its file; or a sequence of I bundles, one
-                for each instance.
-            positions: (I, 3), or (3,) for one instance, in world units; None means the
+            bundle: A bundle, the path of its file, or a sequence of I bundles, one for
+                each instance.
+            positions: (I, 3), or (3,) for one instance, in world units. None means the
                 origin.
-            quaternions: (I, 4), or (4,) for all instances, w x y z; they need not be
+            quaternions: (I, 4), or (4,) for all instances, w x y z. They need not be
                 normalised. None means no rotation.
-            scales: (I,), or one number for all instances, > 0; None means 1.
+            scales: (I,), or one number for all instances, > 0. None means 1.
             importance: (I,), or one number for all instances, > 0. The cut of an
                 instance is selected as if the tolerance were divided by its importance.
             matrix: (I, 4, 4), or (4, 4) for one instance, instead of positions,
@@ -149,16 +149,19 @@ class Scene:
                 rotation, translation and uniform scale.
             up: The axis that points up in the scene. The up axis of the bundle
                 (declared in its file, otherwise -y) is rotated to this axis before the
-                pose is applied. If the scene's `up` is None, it is set to this axis.
-            opacity: (I,), or one number for all instances, 0 to 1: factor of the
+                pose is applied. If the scene has no up axis yet, it is set to this
+                axis.
+            opacity: (I,), or one number for all instances, 0 to 1. It multiplies the
                 opacities of gaussians. Instances with opacity 0 are skipped.
-            tint: (I, 3), or (3,) for all instances, >= 0: factors of red, green and
-                blue. They multiply the evaluated colours, after these are clamped at 0.
-            environment: (I,) or one whole number for all, 0 to 2^24 - 1: the cameras of
-                that environment see the instance (see `CameraBatch.environments`); -1:
-                those of all do. Pictures of a single `Camera` show all instances.
-            label: (I,) or one whole number for all, >= 0: the value in the channel
-                `label` of a picture, such as the class of the object; -1: none.
+            tint: (I, 3), or (3,) for all instances, >= 0. It multiplies red, green and
+                blue of the evaluated colours, after these are clamped at 0.
+            environment: (I,), or one integer for all instances, 0 to 2^24 - 1. The
+                cameras of that environment see the instance (see
+                `CameraBatch.environments`). With -1, all cameras see it. Pictures of a
+                single `Camera` show all instances.
+            label: (I,), or one integer for all instances, >= 0. It is the value in the
+                channel `label` of a picture, such as the class of the object. -1 means
+                no label.
 
         Raises:
             TypeError: ``bundle`` is not a Bundle.
@@ -207,10 +210,10 @@ class Scene:
         """Add all instances of another scene, placed as a whole, and return their ids
         in this scene.
 
-        Poses are composed; importance, opacity and tint are multiplied; an environment
-        and a label replace those of the other scene. Later changes of the other scene
-        have no effect. The arguments are those of `add` for one instance. If the other
-        scene's `up` is None, z is used.
+        Poses are composed, importance, opacity and tint are multiplied, and an
+        environment and a label replace those of the other scene. Later changes of the
+        other scene have no effect. The arguments are those of `add` for one instance.
+        If the other scene has no up axis, z is used.
 
         Raises:
             TypeError: ``scene`` is not a Scene.
@@ -243,8 +246,8 @@ class Scene:
         return self._append(bundles, composed(outer, _columns_of(inner)), up)
 
     def _append(self, bundles: Sequence[Bundle], rows: Columns, up: Axis | None) -> range:
-        """Append instances; `bundles` has one bundle for all of them, or one for each.
-        Return their ids."""
+        """Append instances, and return their ids. `bundles` has one bundle for all of
+        them, or one for each."""
         count = len(rows.importance)
         with _lock:
             self._take_up(up)
@@ -297,23 +300,25 @@ class Scene:
         matrix: Array | npt.ArrayLike | None = None,
         up: Axis | None = None,
     ) -> None:
-        """Change the poses of instances. Parts that are None do not change.
+        """Change the poses of instances. Arguments that are None leave the
+        corresponding values unchanged.
 
         Args:
-            ids: (M,) indices of the instances; None means all. A tensor on the CUDA
-                device of the poses is read there without waiting, and not checked: ids
-                that do not exist are ignored, and of equal ones any pose counts.
+            ids: (M,) indices of the instances. None means all. A tensor on the CUDA
+                device of the poses is read there without waiting, and is not checked.
+                Ids that do not exist are ignored. If an id occurs more than once, any
+                of its poses is used.
             positions: (M, 3) new positions.
             quaternions: (M, 4), or (4,) for all of them: new rotations.
             scales: (M,), or one number for all of them: new scales.
             matrix: (M, 4, 4), or (4, 4) for one instance, instead of positions,
                 quaternions and scales.
-            up: As in `add`; requires new quaternions or matrices. The up axis of the
+            up: As in `add`. Requires new quaternions or matrices. The up axis of the
                 bundles is rotated to this axis before the new rotation is applied.
 
         Raises:
             IndexError: There is no such instance.
-            ValueError: A shape or a value is invalid, see `add`.
+            ValueError: A shape or a value is invalid; see `add`.
         """
         if matrix is not None:
             positions, quaternions, scales = parts_of(matrix, positions, quaternions, scales)
@@ -344,20 +349,20 @@ class Scene:
     def set_importance(
         self, importance: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None
     ) -> None:
-        """Change the importance of instances (see `add`); of all instances if ``ids``
-        is None."""
+        """Change the importance of instances (see `add`). If ``ids`` is None, all
+        instances are changed."""
         self._set("importance", importance, ids)
 
     def set_opacity(self, opacity: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Change the opacity of instances (see `add`); of all instances if ``ids`` is
-        None."""
+        """Change the opacity of instances (see `add`). If ``ids`` is None, all
+        instances are changed."""
         self._set("opacity", opacity, ids)
 
     def set_environment(
         self, environment: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None
     ) -> None:
-        """Put instances into other environments, as in `add`; all of them if ``ids`` is
-        None."""
+        """Move instances to other environments (see `add`). If ``ids`` is None, all
+        instances are moved."""
         with _lock:
             rows = self._ids(ids)
             environments = self._state.environments.copy()
@@ -365,8 +370,8 @@ class Scene:
             self._publish(self._state._replace(environments=environments), changes=1)
 
     def set_label(self, label: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Change the labels of instances (see `add`); of all instances if ``ids`` is
-        None."""
+        """Change the labels of instances (see `add`). If ``ids`` is None, all instances
+        are changed."""
         with _lock:
             rows = self._ids(ids)
             labels = self._state.labels.copy()
@@ -374,8 +379,8 @@ class Scene:
             self._publish(self._state._replace(labels=labels), changes=1)
 
     def set_tint(self, tint: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Change the tint of instances (see `add`); of all instances if ``ids`` is
-        None."""
+        """Change the tint of instances (see `add`). If ``ids`` is None, all instances
+        are changed."""
         self._set("tint", tint, ids)
 
     def _set(self, name: str, values: npt.ArrayLike, ids: Array | npt.ArrayLike | None) -> None:
@@ -385,8 +390,8 @@ class Scene:
             self._publish(self._state._replace(**{name: changed}), changes=1)
 
     def _take_up(self, up: Axis | None) -> None:
-        """Set the up axis; raise ValueError if the scene has a different one. The lock
-        must be held."""
+        """Set the up axis. Raise ValueError if the scene has a different one. The
+        caller must hold the lock."""
         if up is None:
             return
         is_same = self._up in (None, up)
@@ -394,16 +399,15 @@ class Scene:
         self._up = up
 
     def _publish(self, state: _State, changes: int = 0, moves: int = 0, removals: int = 0) -> None:
-        """Replace the state atomically and increase the revision. The lock must be
-        held."""
+        """Replace the state atomically, and increase the revision. The caller must hold
+        the lock."""
         num_changes, num_moves, num_removals = self.revision
         revision = (num_changes + changes, num_moves + moves, num_removals + removals)
         self._state = _read_only(state._replace(revision=revision))
 
     @property
     def up(self) -> Axis | None:
-        """The axis that points up; None if unknown. Viewers and exports then guess
-        it."""
+        """The axis that points up. If it is None, viewers and exports guess it."""
         return self._up
 
     @up.setter
@@ -419,8 +423,8 @@ class Scene:
 
     @property
     def revision(self) -> tuple[int, int, int]:
-        """Numbers of changes so far: first of changes other than poses, then of changes
-        of poses, then of removals (which are also counted in the first).
+        """Three counts of changes so far: changes other than of poses, changes of
+        poses, and removals. A removal also counts as a change of the first kind.
 
         Programs can use the revision to detect that data derived from the scene is
         outdated.
@@ -449,18 +453,18 @@ class Scene:
 
     @property
     def environments(self) -> npt.NDArray[np.int32]:
-        """(I,) int32, the environment of each instance, -1 for those of all; read-
-        only."""
+        """(I,) int32, the environment of each instance, or -1 if all cameras see it;
+        read-only."""
         return self._state.environments
 
     @property
     def labels(self) -> npt.NDArray[np.int32]:
-        """(I,) int32, the label of each instance, -1 for none; read-only."""
+        """(I,) int32, the label of each instance, or -1 if it has none; read-only."""
         return self._state.labels
 
     @property
     def factors(self) -> npt.NDArray[np.float32] | None:
-        """(I, 4) float32, factors of red, green, blue and opacity; None if all factors
+        """(I, 4) float32, factors of red, green, blue and opacity. None if all factors
         are 1."""
         state = self._state
         if (state.opacity == 1).all() and (state.tint == 1).all():
@@ -469,8 +473,8 @@ class Scene:
 
     @property
     def positions(self) -> Floats:
-        """(I, 3) float64 in world units; a copy if the poses are on a device. Use
-        `move` to change positions."""
+        """(I, 3) float64 in world units. If the poses are on a device, this is a copy.
+        Use `move` to change positions."""
         return _device.to_host(self._state.positions)
 
     @property
@@ -496,14 +500,14 @@ class Scene:
 
     @property
     def poses(self) -> tuple[Array, Array, Array]:
-        """Positions, quaternions and scales without copying: NumPy arrays, or tensors
-        on a CUDA device."""
+        """Positions, quaternions and scales without copying, as NumPy arrays or as
+        tensors on a CUDA device."""
         state = self._state
         return state.positions, state.quaternions, state.scales
 
     def _rows(self, ids: Array | npt.ArrayLike | None) -> Array:
-        """Return ids of instances for `move`: unchecked where they and the poses are on
-        a CUDA device, else checked."""
+        """Return ids of instances for `move`. They are checked, unless they and the
+        poses are on a CUDA device."""
         if getattr(ids, "is_cuda", False) and getattr(self._state.positions, "is_cuda", False):
             tensor: Array = ids
             kind = str(tensor.dtype)
@@ -514,7 +518,7 @@ class Scene:
         return self._ids(ids)
 
     def _ids(self, ids: Array | None) -> npt.NDArray[np.int64]:
-        """Return checked indices of instances; all indices if `ids` is None."""
+        """Return checked indices of instances. If `ids` is None, return all indices."""
         count = len(self)
         if ids is None:
             return np.arange(count)
@@ -554,15 +558,15 @@ def _columns_of(scene: Scene) -> Columns:
 
 
 def _check_rows_for_up(rows: Array, up: Axis | None) -> None:
-    """Raise ValueError for rows on a device with an axis that is up: their bundles are
-    known on the host."""
+    """Raise ValueError for rows on a device together with an up axis, because the
+    bundles of the rows must be known on the host."""
     is_on_host = isinstance(rows, np.ndarray)
     check("ids", up is None or is_on_host, "ids on the host beside up, got some on a device")
 
 
 def turn_of(subject: Scene | Bundle, up: Axis) -> Floats:
     """Return the quaternion (4,) w x y z that rotates the up axis of a scene or a
-    bundle to another axis; raise ValueError for an invalid axis."""
+    bundle to another axis. Raise ValueError for an invalid axis."""
     one_of(up, "up", AXES)
     if isinstance(subject, Bundle):
         return turn_between(up_of_bundle(subject), up)
@@ -574,8 +578,8 @@ Subject: TypeAlias = Scene | Bundle | Gaussians
 
 
 def _bundles_of(bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle]) -> list[Bundle]:
-    """Return the bundles in a list or a tuple, or a single bundle, which may be given
-    by its file."""
+    """Return the bundles in a list or a tuple. A single bundle, or the path of its
+    file, gives one bundle."""
     if isinstance(bundle, str | os.PathLike):
         return [Bundle.open(bundle)]
     bundles: list[Bundle] = []

@@ -1,2 +1,2 @@
-"""Adapters for simulators. Each module needs the package of its simulator, which is
-installed separately; docs/simulators.md describes them."""
+"""Adapters for simulators. Each module needs the package of its simulator, which must
+be installed separately. docs/simulators.md describes them."""

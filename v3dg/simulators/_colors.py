@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 
 
 def bytes_of(values: torch.Tensor) -> torch.Tensor:
-    """Return values of 0 to 1 as uint8 with rounding. Other values are clipped."""
+    """Convert values from 0 to 1 to uint8 with rounding.
+
+    Values outside this range are clipped.
+    """
     import torch
 
     return (values.clamp(0, 1) * 255 + 0.5).to(torch.uint8)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def free_ids(
     instances: npt.ArrayLike, scene: Scene, attached: npt.ArrayLike
 ) -> npt.NDArray[np.int64]:
-    """Return (M,) ids of instances; raise ValueError if the scene does not have one, or
-    if one is attached already."""
+    """Return (M,) ids of instances. Raise ValueError if the scene does not have one of
+    them, or if one is already attached to a body."""
     ids = np.atleast_1d(np.asarray(instances)).astype(np.int64)
     is_known = bool(((ids >= 0) & (ids < len(scene))).all())
     check("instances", is_known, f"ids from 0 to {len(scene) - 1}, got {ids.tolist()}")

@@ -22,7 +22,8 @@ def rotations_of(quaternions: torch.Tensor) -> torch.Tensor:
 
 
 def product_of(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Return quaternions (N, 4) x y z w that rotate by `second`, then by `first`."""
+    """Return quaternions (N, 4) x y z w that rotate by `second` first, and then by
+    `first`."""
     import torch
 
     fx, fy, fz, fw = first.unbind(dim=-1)
@@ -38,7 +39,7 @@ def write_viewmats(viewmats: torch.Tensor, positions: torch.Tensor, axes: torch.
     """Write (N, 4, 4) matrices from world to camera.
 
     Args:
-        viewmats: Their last rows are 0 0 0 1 already.
+        viewmats: Their last rows must already be 0 0 0 1.
         positions: (N, 3) eyes in the world.
         axes: (N, 3, 3), whose rows are the directions to the right, down and forward in
             the world.

@@ -10,8 +10,8 @@ import warp
 
 @contextmanager
 def torch_in_order(device: warp.Device) -> Iterator[None]:
-    """Order the work of torch in this context after warp's earlier work and before
-    warp's later work, without waiting on the host. On the CPU, do nothing."""
+    """Order torch's work in this context after warp's earlier work and before warp's
+    later work, without waiting on the host. On the CPU, do nothing."""
     if not device.is_cuda:
         yield
         return

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 
 class PictureVectorEnv(VectorEnv):
-    """N environments side by side in one scene, each with a camera of its own whose
+    """N environments next to each other in one scene. Each has its own camera, whose
     picture is the observation.
 
-    A subclass defines the task by `start_worlds` and `step_worlds`, which move the
-    instances of the scene and write the poses of the cameras. One call draws the
-    pictures of all environments. A camera sees the instances of its environment and the
-    shared ones (`Scene.add(environment=)`).
+    A subclass defines the task by implementing `start_worlds` and `step_worlds`. They
+    move the instances of the scene, and write the poses of the cameras. One call draws
+    the pictures of all environments. A camera sees the instances of its environment and
+    the shared ones (`Scene.add(environment=)`).
 
     Observations (N, H, W, 3) uint8, rewards (N,) float32, and terminations and
     truncations (N,) bool are torch tensors on the device that draws. An environment
@@ -50,14 +50,14 @@ class PictureVectorEnv(VectorEnv):
         width: Width of the pictures in px.
         height: Height of the pictures in px.
         near: As in `CameraBatch`.
-        max_steps: Steps after which an episode is truncated.
+        max_steps: Number of steps after which an episode is truncated.
         background: Colour behind the scene.
         tolerance: As in `Renderer.render_batch`.
         device: "auto", "cpu", "cuda" or, for example, "cuda:1".
 
     Attributes:
-        scene: As above.
-        viewmats: (N, 4, 4) float32 tensor, world to camera, for subclasses to write.
+        scene: The scene that was passed.
+        viewmats: (N, 4, 4) float32 tensor from world to camera, which subclasses write.
         random: The torch generator on the device, which `reset(seed=)` seeds.
         device: The name of the device for torch.
 
@@ -122,12 +122,13 @@ class PictureVectorEnv(VectorEnv):
 
     @abstractmethod
     def start_worlds(self, is_new: torch.Tensor) -> None:
-        """Put some environments into a first state: their instances, and their rows of
-        `viewmats`.
+        """Put some environments into an initial state: their instances, and their rows
+        of `viewmats`.
 
         Args:
-            is_new: (N,) bool, which environments. The others must not change. Use masks
-                (`torch.where`) rather than indices, which would wait for the device.
+            is_new: (N,) bool, the environments to start. The others must not change.
+                Use masks (`torch.where`) instead of indices, which would wait for the
+                device.
         """
 
     @abstractmethod
@@ -138,7 +139,7 @@ class PictureVectorEnv(VectorEnv):
             actions: (N, ...) tensor on the device.
 
         Returns:
-            (N,) rewards, and (N,) bool whether an episode has ended in a last state.
+            (N,) rewards, and (N,) bool whether an episode has reached its final state.
         """
 
     def reset(
@@ -147,7 +148,7 @@ class PictureVectorEnv(VectorEnv):
         """Start all environments, and return their observations and an empty dict.
 
         Args:
-            seed: Seed of `random`; None continues its numbers.
+            seed: Seed of `random`. None continues its sequence.
             options: Not used.
         """
         if seed is not None:

@@ -72,11 +72,14 @@ class SplatRendererCfg(RendererCfg):
     """Type identifier."""
 
     path: str = ""
-    """Bundle (.v3dg) or scene (.json) that stands in every environment, in the axes of
-    the stage. Empty for none: add instances to `SplatRenderer.scene`."""
+    """Bundle (.v3dg) or scene (.json) that is placed in every environment, in the axes
+    of the stage. If it is empty, add instances to `SplatRenderer.scene` instead."""
 
     environment_prims: str = "/World/envs/env_{}"
-    """Prims of the environments. What is at `path` stands at their translations."""
+    """Prims of the environments.
+
+    The content of `path` is placed at their translations.
+    """
 
     depth_background: float = math.inf
     """Depth of pixels without gaussians."""
@@ -85,7 +88,7 @@ class SplatRendererCfg(RendererCfg):
     """As in `v3dg.Renderer.render_batch`."""
 
     device: str = "auto"
-    """Device that draws; "auto" is that of the cameras."""
+    """Device that draws. "auto" means the device of the cameras."""
 
     def supported_output_types(self) -> dict[RenderBufferKind, RenderBufferSpec]:
         """Return the layouts of the supported outputs."""
@@ -103,7 +106,7 @@ class SplatRendererCfg(RendererCfg):
 class RenderData:
     """One camera of every environment."""
 
-    viewmats: torch.Tensor  # (N, 4, 4) world to camera
+    viewmats: torch.Tensor  # (N, 4, 4) from world to camera
     K: torch.Tensor  # (N, 3, 3)
     width: int
     height: int
@@ -113,16 +116,16 @@ class RenderData:
 
 
 class SplatRenderer(BaseRenderer):
-    """Draws gaussians for cameras of Isaac Lab: the picture of environment i has the
+    """Draws gaussians for cameras of Isaac Lab. The picture of environment i shows the
     instances of that environment and the shared ones.
 
     Outputs are `rgb`, `rgba` (with coverage), `depth`, `distance_to_image_plane`,
     `distance_to_camera`, `normals` (in the world), `semantic_segmentation` (labels of
-    the scene, -1 for none) and `instance_segmentation` (ids of instances); ids are
+    the scene, -1 for none) and `instance_segmentation` (ids of instances). Ids are
     int32, not colours. Meshes of the stage are not drawn.
 
-    The renderer of a simulation is `sim.get_or_create_backend(cfg)`. Move instances in
-    every step by `renderer.scene.move`, with tensors on the device:
+    Call `sim.get_or_create_backend(cfg)` to get the renderer of a simulation. In every
+    step, move instances with `renderer.scene.move`, using tensors on the device:
     `asset.data.root_pos_w.torch`, and `root_quat_w` as w x y z.
 
     Attributes:
@@ -141,15 +144,16 @@ class SplatRenderer(BaseRenderer):
         return self.cfg.supported_output_types()
 
     def prepare_stage(self, stage: Usd.Stage | None, num_envs: int) -> None:
-        """Add what is at `cfg.path` once for each environment.
+        """Add the content of `cfg.path` once for each environment.
 
         Args:
-            stage: A `Usd.Stage`, or None: all environments have the same origin.
+            stage: A `Usd.Stage`. With None, all environments have the same origin.
             num_envs: Number of environments.
 
         Raises:
             OSError: The file cannot be read.
-            ValueError: It is no bundle or scene, or an environment has no prim.
+            ValueError: The file is not a bundle or a scene, or an environment has no
+                prim.
         """
         if not self.cfg.path:
             return
@@ -195,16 +199,16 @@ class SplatRenderer(BaseRenderer):
         )
 
     def set_outputs(self, render_data: RenderData, output_data: dict[str, ProxyArray]) -> None:
-        """Take the buffers (N, H, W, C) into which `render` writes."""
+        """Store the buffers (N, H, W, C) to which `render` writes."""
         render_data.outputs = {
             RenderBufferKind(name): array.torch for name, array in output_data.items()
         }
 
     def update_transforms(self) -> None:
-        """Do nothing: the simulation moves instances by `scene.move`."""
+        """Do nothing, because the simulation moves instances with `scene.move`."""
 
     def update_geometries(self) -> None:
-        """Do nothing: gaussians do not change."""
+        """Do nothing, because gaussians do not change."""
 
     def update_camera(
         self,
@@ -213,8 +217,8 @@ class SplatRenderer(BaseRenderer):
         orientations: ProxyArray,
         intrinsics: ProxyArray,
     ) -> None:
-        """Set the poses of the cameras, whose axes are x forward, y left and z up, and
-        their intrinsics."""
+        """Set the poses and the intrinsics of the cameras. The axes of a pose are x
+        forward, y left and z up."""
         import torch
 
         with torch_in_order(positions.warp.device):
@@ -282,7 +286,7 @@ class SplatRenderer(BaseRenderer):
         return torch.as_tensor(pictures.instance)[..., None]
 
     def read_output(self, render_data: RenderData, camera_data: CameraData) -> None:
-        """Do nothing: `render` has written the camera's buffers."""
+        """Do nothing, because `render` has written the camera's buffers."""
 
     def cleanup(self, render_data: RenderData | None) -> None:
         """Release the buffers of a camera."""

@@ -1,4 +1,5 @@
-"""MuJoCo: its cameras and bodies in a scene of gaussians, and its meshes among them.
+"""MuJoCo: draws its cameras and bodies in a scene of gaussians, with its meshes between
+the gaussians.
 
 MuJoCo draws its geoms with OpenGL. Without a display, set the environment variable
 MUJOCO_GL to "egl" or "osmesa" before MuJoCo is imported.
@@ -33,43 +34,47 @@ if TYPE_CHECKING:
     from v3dg.render.sensor import Channel
 
 CameraName: TypeAlias = "str | int | mujoco.MjvCamera"
-"""A camera of a model, by its name or its id, or one of a viewer; -1 is the free camera
-with which MuJoCo starts."""
+"""A camera of a model by its name or its id, or a camera of a viewer. -1 is the free
+camera with which MuJoCo starts."""
 
 FIRST_GEOM = 1 << 24
-"""A geom is the instance of this number plus its id."""
+"""A geom appears as the instance with this number plus the geom's id."""
 _FREE = -1
-_SAME_ASPECT = 1e-3  # relative; models are written with a few digits
+_SAME_ASPECT = 1e-3  # relative, because models are written with a few digits
 
 
 def camera_of(
     model: mujoco.MjModel, data: mujoco.MjData, camera: CameraName, *, width: int, height: int
 ) -> Camera:
-    """Return a camera of a model as MuJoCo draws it, with its near plane and its
+    """Return a camera of a model as MuJoCo draws it, with MuJoCo's near plane and
     intrinsics.
 
     Args:
         model: The model.
-        data: Its state, for which `mj_forward` or a step has computed poses.
+        data: The state of the model. `mj_forward` or a step must have computed its
+            poses.
         camera: See `CameraName`.
         width: Width of the picture in px.
         height: Height of the picture in px.
 
     Raises:
-        ValueError: There is no such camera, its projection is orthographic, or it has a
-            sensor of another aspect than the picture or pixels that are not square,
-            which MuJoCo does not draw.
+        ValueError: There is no such camera; its projection is orthographic; its sensor
+            has another aspect ratio than the picture; or its pixels are not square,
+            which MuJoCo does not support.
     """
     scene = mujoco.MjvScene(model, maxgeom=1)
     mujoco.mjv_updateCamera(model, data, _view_of(model, camera), scene)
-    # Both eyes, which differ only for stereo, at their middle.
+    # Use the middle between both eyes, which only differ for stereo.
     eye = mujoco.mjv_averageCamera(scene.camera[0], scene.camera[1])
     check("camera", not eye.orthographic, f"a perspective projection, got {camera!r} without")
     return _from_frustum(eye, width, height)
 
 
 def _from_frustum(eye: mujoco.MjvGLCamera, width: int, height: int) -> Camera:
-    """Convert a camera of OpenGL, whose frustum is in world units at its near plane."""
+    """Convert a camera of OpenGL.
+
+    Its frustum is given in world units at the near plane.
+    """
     near = float(eye.frustum_near)
     bottom = float(eye.frustum_bottom)
     top = float(eye.frustum_top)
@@ -91,7 +96,7 @@ def _from_frustum(eye: mujoco.MjvGLCamera, width: int, height: int) -> Camera:
 
 
 def _view_of(model: mujoco.MjModel, camera: CameraName) -> mujoco.MjvCamera:
-    """Return a camera of a model as one of MuJoCo's viewer."""
+    """Convert a camera of a model to a camera of MuJoCo's viewer."""
     if isinstance(camera, mujoco.MjvCamera):
         return camera
     view = mujoco.MjvCamera()
@@ -107,7 +112,7 @@ def _view_of(model: mujoco.MjModel, camera: CameraName) -> mujoco.MjvCamera:
 def _id_of(
     model: mujoco.MjModel, kind: mujoco.mjtObj, item: str | int, name: str, lowest: int
 ) -> int:
-    """Return the id of an object of a model that is given by its name or its id."""
+    """Return the id of an object of a model, given its name or its id."""
     counts = {mujoco.mjtObj.mjOBJ_CAMERA: model.ncam, mujoco.mjtObj.mjOBJ_BODY: model.nbody}
     count = counts[kind]
     if isinstance(item, str):
@@ -132,13 +137,13 @@ def cameras_of(
     Args:
         model: The model.
         data: One state, or E states of the model, one for each environment of a scene.
-        cameras: C cameras; None means all of the model.
+        cameras: C cameras. None means all cameras of the model.
         width: Width of the pictures in px.
         height: Height of the pictures in px.
 
     Returns:
-        C cameras, which see everything; or E x C cameras, all of the first environment
-        first, each of which sees its environment and the shared instances.
+        C cameras that see everything; or E x C cameras, beginning with all of the first
+        environment, each of which sees its environment and the shared instances.
 
     Raises:
         ValueError: As for `camera_of`, or there is no camera.
@@ -161,12 +166,12 @@ def cameras_of(
 
 
 class Attachments:
-    """Instances of a scene that move with bodies of a model.
+    """Instances of a scene that move together with bodies of a model.
 
     Args:
         model: The model.
-        scene: The scene; several models, or several states of one, may move instances
-            of the same scene.
+        scene: The scene. Several models, or several states of one model, may move
+            instances of the same scene.
     """
 
     def __init__(self, model: mujoco.MjModel, scene: Scene) -> None:
@@ -186,7 +191,7 @@ class Attachments:
         position: npt.ArrayLike = (0.0, 0.0, 0.0),
         quaternion: npt.ArrayLike = (1.0, 0.0, 0.0, 0.0),
     ) -> None:
-        """Attach instances to a body, from the next `move` on.
+        """Attach instances to a body. `move` then moves them.
 
         Args:
             instances: Ids in the scene, as `Scene.add` returns them.
@@ -195,8 +200,8 @@ class Attachments:
             quaternion: (4,) w x y z, their rotation in these axes.
 
         Raises:
-            ValueError: There is no such body or instance, or an instance is attached
-                already.
+            ValueError: There is no such body or instance, or an instance is already
+                attached.
         """
         ids = free_ids(instances, self.scene, self._instances)
         number = _id_of(self._model, mujoco.mjtObj.mjOBJ_BODY, body, "body", 0)
@@ -211,8 +216,8 @@ class Attachments:
         self._quaternions = np.concatenate([self._quaternions, turns])
 
     def move(self, data: mujoco.MjData) -> None:
-        """Move the instances to where the bodies are in a state of the model. Their
-        scales do not change."""
+        """Move the instances to the positions of their bodies in a state of the model.
+        Their scales do not change."""
         if not len(self._instances):
             return
         turns = np.array(data.xquat, np.float64)[self._bodies]
@@ -224,22 +229,22 @@ class Attachments:
 
 
 class MeshRenderer:
-    """Draws the geoms of a model as `MeshLayer`s, by MuJoCo's own renderer.
+    """Draws the geoms of a model as `MeshLayer`s, using MuJoCo's own renderer.
 
-    MuJoCo draws several samples a pixel. Colours are averages of samples, coverage is
-    the share of samples with a geom, and ids and depth are those of the nearest sample.
-    Translucent geoms count as opaque, and MuJoCo's sky is not drawn. Use it as a
-    context manager, or close it.
+    MuJoCo draws several samples per pixel. Colours are averages of the samples,
+    coverage is the fraction of samples with a geom, and ids and depth are those of the
+    nearest sample. Translucent geoms count as opaque, and MuJoCo's sky is not drawn.
+    Use this object as a context manager, or close it.
 
     Args:
         model: The model.
         width: Width of the pictures in px.
         height: Height of the pictures in px.
         samples: Number of samples of a pixel along each axis.
-        option: Which geoms are visible; None means MuJoCo's default, the geom groups 0
-            to 2. Put geoms that only collide, because gaussians show the object, into
-            group 3.
-        labels: (ngeom,) labels of the geoms for the channel `label`; None means that
+        option: Which geoms are visible. None means MuJoCo's default, the geom groups 0
+            to 2. If gaussians show an object whose geoms are only needed for
+            collisions, put these geoms into group 3.
+        labels: (ngeom,) labels of the geoms for the channel `label`. None means that
             they have none.
 
     Raises:
@@ -291,7 +296,7 @@ class MeshRenderer:
         depths: npt.NDArray[np.float32],
         geoms: npt.NDArray[np.int32],
     ) -> MeshLayer:
-        """Resolve the samples of each pixel."""
+        """Combine the samples of each pixel."""
         color_samples = self._by_pixel(colors).astype(np.float32) / 255
         geom_samples = self._by_pixel(geoms).astype(np.int32)[..., 0]
         is_hit = geom_samples >= 0
@@ -312,7 +317,7 @@ class MeshRenderer:
         )
 
     def _by_pixel(self, samples: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-        """Return (H, W, S, C) of samples (sH, sW) or (sH, sW, C)."""
+        """Rearrange samples (sH, sW) or (sH, sW, C) to (H, W, S, C)."""
         side = self._samples
         shape = (self.height, side, self.width, side, -1)
         blocks = samples.reshape(shape).swapaxes(1, 2)
@@ -330,8 +335,9 @@ class MeshRenderer:
 
 
 def _make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
-    """Make a renderer whose framebuffer has a size, without MuJoCo's multisampling,
-    which would mix the sky into samples at edges. The model is the same afterwards."""
+    """Make a renderer with a framebuffer of a given size. MuJoCo's multisampling is
+    off, because it would mix the sky into samples at edges. Afterwards, the model is
+    unchanged."""
     screen = model.vis.global_
     quality = model.vis.quality
     settings = (screen.offwidth, screen.offheight, quality.offsamples)
@@ -345,17 +351,17 @@ def _make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Ren
 
 
 class SplatRenderer:
-    """Draws a model of MuJoCo in a scene of gaussians: its geoms as meshes, gaussians
-    that are attached to its bodies, and the remaining scene.
+    """Draws a model of MuJoCo in a scene of gaussians: its geoms as meshes, the
+    gaussians that are attached to its bodies, and the rest of the scene.
 
-    Use it as a context manager, or close it.
+    Use this object as a context manager, or close it.
 
     Args:
         model: The model.
         scene: The scene, in the units and the axes of the model (z up).
         width: Width of the pictures in px.
         height: Height of the pictures in px.
-        samples: As in `MeshRenderer`; so are `option` and `labels`.
+        samples: As in `MeshRenderer`, like `option` and `labels`.
         device: As in `v3dg.render`.
 
     Attributes:
@@ -394,10 +400,12 @@ class SplatRenderer:
         """Draw a state of the model.
 
         Args:
-            data: `mj_forward` or a step has computed the poses.
+            data: The state of the model. `mj_forward` or a step must have computed its
+                poses.
             camera: See `CameraName`.
-            tolerance: As in `v3dg.render`; so are `background` and `channels`. Where a
-                geom has the largest weight, `instance` is `FIRST_GEOM` plus its id.
+            tolerance: As in `v3dg.render`, like `background` and `channels`. Where a
+                geom has the largest weight, `instance` is `FIRST_GEOM` plus the geom's
+                id.
         """
         self.attachments.move(data)
         meshes = self.meshes

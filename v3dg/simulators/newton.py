@@ -1,5 +1,5 @@
-"""Newton: a camera sensor beside `newton.sensors.SensorCamera` that rasterizes
-gaussians, with a view in each world."""
+"""Newton: a camera sensor that rasterizes gaussians, with a view in each world. It has
+the calls of `newton.sensors.SensorCamera`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 NO_SHAPE = 0xFFFFFFFF
 """The shape index of pixels without a shape, as in Newton."""
 FIRST_SHAPE = 1 << 24
-"""A shape that is drawn as a mesh is the instance of this number plus its index."""
+"""A shape that is drawn as a mesh appears as the instance with this number plus the
+shape's index."""
 _WORLD = -1
 
 
@@ -65,24 +66,26 @@ def gaussians_of(gaussian: newton.Gaussian) -> Gaussians:
 class SplatCamera:
     """Camera sensor for a model of Newton, with the calls of Newton's `SensorCamera`.
 
-    The shapes of type GAUSSIAN of the model are instances of one bundle for each
-    distinct `newton.Gaussian`: they move with their bodies, and belong to the
-    environment of their world, or to all if they belong to none. Further instances may
-    be added to `scene` and attached to bodies. Other shapes are not drawn: pass
-    pictures of Newton's `SensorCamera` as `mesh` (see `mesh_layer`).
+    The model's shapes of type GAUSSIAN become instances of one bundle for each distinct
+    `newton.Gaussian`. They move with their bodies, and belong to the environment of
+    their world, or to all if they have no world. More instances may be added to `scene`
+    and attached to bodies. Other shapes are not drawn; for them, pass pictures of
+    Newton's `SensorCamera` as `mesh` (see `mesh_layer`).
 
-    Everything happens on the model's device, in order with warp's current stream.
+    All work runs on the model's device, ordered with warp's current stream.
 
     Args:
         model: A finalized model.
         width: Width of the pictures in px.
         height: Height of the pictures in px.
-        camera_fov: Vertical field of view in radians; or K.
-        K: (3, 3), or (V, 3, 3) for views: focal lengths and principal points in px.
+        camera_fov: Vertical field of view in radians. Pass either this or K.
+        K: (3, 3), or (V, 3, 3) with one for each view: focal lengths and principal
+            points in px.
         near: As in `v3dg.CameraBatch`.
         background: Colour behind the gaussians.
         tolerance: As in `v3dg.Renderer.render_batch`.
-        config: How levels of the model's gaussians are built; None means the default.
+        config: Settings for building levels of the model's gaussians. None means the
+            default settings.
 
     Attributes:
         scene: The instances. Those of the model's shapes come first.
@@ -124,7 +127,7 @@ class SplatCamera:
         self._renderer: Renderer | None = None
 
     def _add_shapes(self, config: BuildConfig | None) -> list[int]:
-        """Add the gaussians of the model to the scene; return their shapes."""
+        """Add the gaussians of the model to the scene, and return their shapes."""
         model = self._model
         bundles: dict[int, Bundle] = {}
         types = model.shape_type.numpy()
@@ -157,17 +160,17 @@ class SplatCamera:
         bodies: npt.ArrayLike,
         transforms: npt.ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
     ) -> None:
-        """Attach instances of `scene` to bodies, from the next `update` on.
+        """Attach instances of `scene` to bodies. `update` then moves them.
 
         Args:
             instances: (M,) ids, as `Scene.add` returns them.
-            bodies: (M,) indices of bodies, or one for all; -1 is the world.
-            transforms: (M, 7), or (7,) for all: from instance to body, x y z and the
-                quaternion x y z w, as Newton's.
+            bodies: (M,) indices of bodies, or one index for all. -1 is the world.
+            transforms: (M, 7), or (7,) for all: from instance to body, as x y z and the
+                quaternion x y z w, like Newton's.
 
         Raises:
-            ValueError: There is no such body or instance, or an instance is attached
-                already.
+            ValueError: There is no such body or instance, or an instance is already
+                attached.
         """
         ids = free_ids(instances, self.scene, self._instances)
         count = len(ids)
@@ -196,25 +199,26 @@ class SplatCamera:
         normal_image: warp.array | None = None,
         mesh: MeshLayer | None = None,
     ) -> RenderedBatch:
-        """Draw V views. Images are written as Newton's `SensorCamera.update` does, and
-        have 0 where nothing is drawn, `shape_index_image` `NO_SHAPE`.
+        """Draw V views. Images are written as Newton's `SensorCamera.update` does.
+        Where nothing is drawn, they are 0, and `shape_index_image` is `NO_SHAPE`.
 
         Args:
             state: The poses of the bodies.
-            camera_transforms: (V,) transformf: cameras in the world, which look along
-                -z, with y up.
-            world_indices: (V,) int32: the world of each view; it sees the shapes of
-                that world and those of none. None means that view i shows world i.
-            color_image: (V, H, W) uint32, bytes red, green, blue, coverage.
+            camera_transforms: (V,) transformf: cameras in the world that look along -z,
+                with y up.
+            world_indices: (V,) int32: the world of each view. A view shows the shapes
+                of that world, and those without a world. None means that view i shows
+                world i.
+            color_image: (V, H, W) uint32 with the bytes red, green, blue, coverage.
             depth_image: (V, H, W) float32: distance along the ray.
             forward_depth_image: (V, H, W) float32: depth along the camera's axis.
-            shape_index_image: (V, H, W) uint32: the shape with the largest weight;
-                `NO_SHAPE` for instances that belong to no shape, and for meshes.
+            shape_index_image: (V, H, W) uint32: the shape with the largest weight. It
+                is `NO_SHAPE` for instances that belong to no shape, and for meshes.
             normal_image: (V, H, W) vec3f in the world.
             mesh: Meshes among the gaussians.
 
         Returns:
-            The pictures, NumPy arrays or torch tensors on the model's device.
+            The pictures, as NumPy arrays or as torch tensors on the model's device.
 
         Raises:
             ValueError: An argument has another shape, or is on another device.
@@ -259,7 +263,7 @@ class SplatCamera:
         )
 
     def _move(self, state: newton.State) -> None:
-        """Move instances to where their bodies are."""
+        """Move instances to the positions of their bodies."""
         if not self._instances:
             return
         if self._tensors is None:
@@ -302,7 +306,7 @@ class SplatCamera:
 
 
 class _Attached:
-    """Attached instances as tensors on the device of a model."""
+    """Attached instances, as tensors on the device of a model."""
 
     def __init__(
         self,
@@ -335,7 +339,7 @@ class _Attached:
 def _intrinsics_of(
     camera_fov: float | None, K: npt.ArrayLike | None, width: int, height: int
 ) -> npt.NDArray[np.float64]:
-    """Return K of a vertical field of view, or a given K."""
+    """Return K for a vertical field of view, or the K that was passed."""
     is_one = (camera_fov is None) != (K is None)
     check("camera_fov, K", is_one, "one of them, got both or neither")
     if camera_fov is None:
@@ -369,7 +373,8 @@ def _write(image: warp.array, name: str, values: torch.Tensor | npt.NDArray[np.g
 
 
 def _packed(pictures: RenderedBatch) -> torch.Tensor:
-    """Return colours (V, H, W), red in the lowest byte and coverage in the highest."""
+    """Return packed colours (V, H, W), with red in the lowest byte and coverage in the
+    highest."""
     import torch
 
     values = rgba_of(pictures).long()
@@ -380,13 +385,14 @@ def _packed(pictures: RenderedBatch) -> torch.Tensor:
 def _in_world(
     normals: torch.Tensor | npt.NDArray[np.float32], cameras: CameraBatch
 ) -> torch.Tensor:
-    """Return normals (V, H, W, 3) in the world from those in the axes of cameras."""
+    """Convert normals (V, H, W, 3) from the axes of the cameras to the world."""
     import torch
 
     in_view = torch.as_tensor(normals)
     viewmats = cameras.viewmats
     if not in_view.is_cuda:
-        viewmats = np.array(viewmats)  # a copy, because torch warns of read-only arrays
+        # a copy, because torch warns about read-only arrays
+        viewmats = np.array(viewmats)
     rotations = torch.as_tensor(viewmats)[:, None, :3, :3].to(in_view.dtype)
     return in_view @ rotations
 
@@ -397,14 +403,14 @@ def mesh_layer(
     *,
     shape_index_image: warp.array | None = None,
 ) -> MeshLayer:
-    """Return pictures (V, H, W) of Newton's `SensorCamera` as meshes among gaussians.
-    Hide the gaussians of the model from `SensorCamera`, so that they are not drawn
-    twice: a shape with `is_visible=False` is drawn by `SplatCamera` only.
+    """Convert pictures (V, H, W) of Newton's `SensorCamera` to meshes between
+    gaussians. Hide the gaussians of the model from `SensorCamera`, so that they are not
+    drawn twice. A shape with `is_visible=False` is only drawn by `SplatCamera`.
 
     Args:
         color_image: uint32, with bytes in sRGB.
-        forward_depth_image: Depth along the camera's axis, 0 where nothing is.
-        shape_index_image: Its numbers become the channel `instance`, plus 2^24.
+        forward_depth_image: Depth along the camera's axis, 0 where there is nothing.
+        shape_index_image: Its numbers plus 2^24 become the channel `instance`.
     """
     depth = forward_depth_image.numpy()
     packed = color_image.numpy()

@@ -36,8 +36,8 @@ class Limits(msgspec.Struct):
     """The limits of values that the viewer accepts.
 
     Attributes:
-        picture_px: Largest length of a picture's longer side.
-        path_seconds: Largest duration of a path.
+        picture_px: Maximum length of a picture's longer side.
+        path_seconds: Maximum duration of a path.
     """
 
     tolerance: tuple[float, float]
@@ -51,9 +51,9 @@ class Hello(msgspec.Struct, tag="hello"):
     """The first message of a connection.
 
     Attributes:
-        version: Version of the viewer. A page of another version reloads itself.
+        version: Version of the viewer. A web page of another version reloads itself.
         up: The direction that points up in the world.
-        asks_up: Whether `up` is only assumed; then the page asks the user.
+        asks_up: Whether `up` is only assumed. If so, the web page asks the user.
         settings: The initial settings of a tab.
         defaults: The default of each setting.
     """
@@ -87,16 +87,16 @@ class Scene(msgspec.Struct, tag="scene"):
         homes: First views for windows from narrow to wide.
         instances: Number of instances.
         has_files: Whether all bundles are in files, so that the scene can be saved.
-        writes_files: Whether the server writes new assets beside the file of the
-            subject; otherwise the browser saves them.
+        writes_files: Whether the server writes new assets next to the file of the
+            subject. If not, the browser saves them.
         level_colors: Colour of each level.
         ramp: Colours for values from the smallest to the largest.
-        most_counted: Number of gaussians in a pixel at which the last colour of the
-            ramp is reached.
+        most_counted: Number of gaussians in a pixel that is shown in the last colour of
+            the ramp.
         modes: The available display modes.
         shows_cuts: Whether freezing, splitting and picking are available.
-        missing_colors: Colours of gaussians that are drawn in place of no, one, two and
-            three missing finer levels.
+        missing_colors: Colours of gaussians that are drawn because zero, one, two or
+            three finer levels are missing.
     """
 
     name: str
@@ -142,10 +142,10 @@ class Picture(msgspec.Struct, tag="picture"):
         number: Number of the request.
         size: Width and height, px.
         view: The viewpoint of the picture.
-        range: The values of the darkest and the brightest colour, if colours represent
+        range: The values of the darkest and the brightest colour if colours represent
             values.
-        distance: Median depth around the middle, in world units; null if nothing is
-            there, or if it is unknown.
+        distance: Median depth around the middle, in world units. It is null if nothing
+            is there, or if it is unknown.
     """
 
     final: bool
@@ -165,7 +165,7 @@ class Failed(msgspec.Struct, tag="failed"):
 
 
 class Notice(msgspec.Struct, tag="notice"):
-    """A message for the user, shown once."""
+    """A message for the user. It is shown once."""
 
     text: str
 
@@ -177,7 +177,7 @@ class Progress(msgspec.Struct, tag="progress"):
 
 
 class Done(msgspec.Struct, tag="done"):
-    """The work that the page requested has ended."""
+    """The work that the web page requested has ended."""
 
 
 class File(msgspec.Struct, tag="file"):
@@ -195,12 +195,13 @@ class Pose(msgspec.Struct):
 
 
 class Picked(msgspec.Struct, tag="picked"):
-    """The answer to `Pick`: an instance. All fields are unset if there is none.
+    """The answer to `Pick`: an instance. If there is none, no field is set.
 
     Attributes:
         box: Minimum and maximum corner of the instance's bundle, in the coordinates of
             the bundle.
-        bundle: Name of the bundle's file; empty if the bundle is not in a file.
+        bundle: Name of the bundle's file, or an empty text if the bundle is not in a
+            file.
         point: The picked point in the world.
     """
 

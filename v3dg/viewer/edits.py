@@ -1,5 +1,4 @@
-"""New assets that a page requests: checks of their names, and writing of their
-files."""
+"""Checks the names of new assets that a web page requests, and writes their files."""
 
 import os
 from pathlib import Path
@@ -30,7 +29,8 @@ def write_new_asset(folder: Path, name: str, gaussians: Gaussians) -> None:
     check_new_name(name)
     path = folder / name
     try:
-        # An empty file reserves the name first, so that two pages cannot both write it.
+        # First, an empty file reserves the name, so that two web pages cannot both
+        # write it.
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except FileExistsError:
         raise ValueError(

@@ -22,13 +22,13 @@ def bundle_names(scene: Scene) -> list[str]:
 
 
 class Tell(Protocol):
-    """Sends a message to the page, optionally with binary data."""
+    """Sends a message to the web page, optionally with binary data."""
 
     def __call__(self, answer: Answer, data: bytes = b"") -> None: ...
 
 
 class Exporter:
-    """Runs one piece of work at a time in a separate thread, until it is done or
+    """Runs one piece of work at a time in a separate thread, until it is finished or
     stopped.
 
     Args:
@@ -69,7 +69,7 @@ class Exporter:
             work(self._stop)
         except Exception as error:
             answer = Notice(f"Not done: {self._explain(error)}")
-        with contextlib.suppress(Exception):  # the page may be closed
+        with contextlib.suppress(Exception):  # the web page may be closed
             self._tell(answer)
 
     def save(self, name: str, write: Callable[[Path], object]) -> None:

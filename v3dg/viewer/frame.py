@@ -1,5 +1,5 @@
-"""Draws one picture for the viewer: computes pixels and statistics from a scene, a view
-and settings."""
+"""Draws one picture for the viewer. It computes pixels and statistics from a scene, a
+view and settings."""
 
 import functools
 import threading
@@ -38,10 +38,11 @@ Shows: TypeAlias = Literal[
     "appearance", "level", "cluster", "error", "residency", "depth", "alpha", "count", "difference"
 ]
 
-# Number of gaussians in a pixel at which the brightest colour is reached.
+# The brightest colour stands for at least this number of gaussians in a pixel.
 MOST_COUNTED = 256
 _MODES_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
-# Up to this number of gaussians, all are drawn even while the camera moves.
+# If there are at most this many gaussians, all of them are drawn even while the camera
+# moves.
 _FEW_GAUSSIANS = 500_000
 # Height in px of the picture for which a first view is computed. Only the aspect ratio
 # matters.
@@ -54,15 +55,16 @@ class Settings:
     """The content and quality of a picture.
 
     Attributes:
-        shows: The display mode: the gaussians' own colours; the colours of levels,
-            clusters or missing pages; the error, which is the screen area per gaussian
-            of a coarser cluster; expected depth; alpha; the number of gaussians that a
-            pixel blends; or the difference from the picture of all gaussians.
+        shows: The display mode. It is one of the gaussians' own colours; the colours of
+            levels, clusters or missing pages; the error, which is the screen area per
+            gaussian of a coarser cluster; expected depth; alpha; the number of
+            gaussians that a pixel blends; and the difference from the picture of all
+            gaussians.
         tolerance, budget, min_level, fade: As in `v3dg.render`, but the tolerance is
             never None.
         gain: Factor by which differences are multiplied.
-        split: Left part of the picture, as a fraction of its width, that shows all
-            gaussians; 0 for no split.
+        split: The left part of the picture that shows all gaussians, as a fraction of
+            its width. 0 means no split.
         frozen: The view for which the cut is selected; None for the view of the
             picture.
         background: Red, green and blue, 0 to 1, behind the gaussians. Modes whose
@@ -89,11 +91,11 @@ class Frame:
         figures: Statistics of the cut, except that times are those of the whole
             picture.
         shows: The display mode, as in `Settings`.
-        value_range: The values of the darkest and the brightest colour, if colours
+        value_range: The values of the darkest and the brightest colour if colours
             represent values.
         view: The viewpoint of the picture.
-        distance: Median depth around the middle, in world units; None if nothing is
-            there, or if it is unknown.
+        distance: Median depth around the middle, in world units. It is None if nothing
+            is there, or if it is unknown.
     """
 
     pixels: Pixels
@@ -146,8 +148,8 @@ class _Drawn(NamedTuple):
 
     Attributes:
         color, alpha, depth: As in `_Planes`, for the part to the right of the split.
-        whole: The picture of all gaussians for comparison, from the left edge up to the
-            split or the right edge; None without a comparison.
+        whole: The picture of all gaussians for comparison, from the left edge to the
+            split or to the right edge. It is None without a comparison.
         figures: The statistics of drawing.
     """
 
@@ -159,7 +161,7 @@ class _Drawn(NamedTuple):
 
 
 class _Painting(NamedTuple):
-    """The colours of the part to the right of the split; the other fields are as in
+    """The colours of the part to the right of the split. The other fields are as in
     `Frame`."""
 
     colors: _Float32
@@ -181,7 +183,8 @@ class SceneView:
             can be used.
         memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time.
             Pictures are then compared with the finest cut that fits into the pool,
-            selected for the same camera; on CUDA, comparisons are not available.
+            selected for the same camera. With a pool on CUDA, comparisons are not
+            available.
 
     Attributes:
         scene: The subject as a scene.
@@ -216,20 +219,19 @@ class SceneView:
         return frame_subject(self.scene)
 
     def first_view(self, up: VectorLike, aspect: float) -> tuple[View, Floats]:
-        """Return the first view of a tab, and the (3,) point around which its camera
-        orbits."""
+        """Return the first view of a tab, and the (3,) point that its camera orbits."""
         height = _FIRST_PIXELS
         camera = self.framing.camera(up, max(round(aspect * height), 1), height)
         return replace(View.of_camera(camera), aspect=aspect), self.framing.focus(camera)
 
     @property
     def draws_all_while_moving(self) -> bool:
-        """Whether every picture draws all gaussians, because drawing them is fast
-        enough."""
+        """Whether drawing all gaussians is so fast that every picture shows all of
+        them."""
         return self.device.is_cuda or self.num_gaussians <= _FEW_GAUSSIANS
 
     def explain(self, error: Exception) -> str:
-        """Return a line of text about an error. It contains the names of bundles but
+        """Return a line of text about an error. It contains the names of bundles, but
         not their paths, because the tab may belong to another user."""
         text = " ".join(str(error).split())
         for path in (bundle.path for bundle in self.scene.bundles):
@@ -263,14 +265,14 @@ class SceneView:
         patience: float = 0.0,
     ) -> Frame:
         """Draw a picture of ``size`` (width, height) px. ``steps`` is the pacing state
-        of a sequence of pictures; None for a single one.
+        of a sequence of pictures, or None for a single one.
 
         Drawing waits up to ``patience`` seconds for missing pages of a pool.
 
         Raises:
-            Stopped: ``stop`` was requested; drawing ends soon after that.
-            ValueError: The budget is too small for any cut, or a page that is needed is
-                damaged.
+            Stopped: ``stop`` was requested. Drawing ends soon after that.
+            ValueError: The budget is too small for any cut, or a page that the picture
+                needs is damaged.
         """
         _check(stop)
         # Settings from a link may request a mode that is not available.
@@ -447,15 +449,15 @@ class SceneView:
 
 
 def _color_by(shows: Shows) -> ColorBy:
-    """Return the colours with which gaussians are drawn. `_paint` computes the other
-    modes from those pictures."""
+    """Return the colours in which gaussians are drawn. `_paint` computes the other
+    modes from these pictures."""
     if shows in ("level", "cluster", "residency"):
         return shows
     return "appearance"
 
 
 def _look_of(shows: Shows) -> ColorBy | Literal["error", "count"]:
-    """Return the mode of `v3dg.render.Look` that a display mode is drawn with."""
+    """Return the mode of `v3dg.render.Look` for drawing a display mode."""
     if shows in ("error", "count"):
         return shows
     return _color_by(shows)
@@ -490,7 +492,7 @@ def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
 
 
 def _on_background(color: _Float32, alpha: _Float32, settings: Settings) -> _Float32:
-    """Return (H, W, 3) the premultiplied colours composited over the background."""
+    """Return (H, W, 3) the premultiplied colours over the background."""
     colors = np.asarray(_device.to_host(color))
     if not any(settings.background):
         return colors
@@ -499,8 +501,8 @@ def _on_background(color: _Float32, alpha: _Float32, settings: Settings) -> _Flo
 
 
 def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
-    """Return the median depth of the covered pixels around the middle; None if no pixel
-    there is covered."""
+    """Return the median depth of the covered pixels around the middle, or None if none
+    of them is covered."""
     middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
     covered = depth[middle][alpha[middle] > 0.5]
     if not covered.size:
@@ -509,8 +511,8 @@ def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
 
 
 def _depth_range(alpha: _Float32, depth: _Float32) -> tuple[float, float]:
-    """Return the depths of the nearest and the farthest colour. They are percentiles,
-    so that a few distant gaussians have no effect."""
+    """Return the depths that are shown in the nearest and the farthest colour. They are
+    percentiles, so that a few distant gaussians have no effect."""
     covered = depth[alpha > 0.5]
     if not covered.size:
         return 0.0, 1.0

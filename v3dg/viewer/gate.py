@@ -1,10 +1,10 @@
 """Decides who may connect to the viewer's server, by the headers of a request.
 
 Any web page can make a visitor's browser connect to this machine. The browser sends the
-name of the server (Host), the site of the page (Origin, which is absent for pictures,
-scripts and links), and the relation between the two (Sec-Fetch-Site, which browsers
-omit for unencrypted connections to other machines). A page cannot change any of these
-headers.
+name of the server (Host), the site of the web page (Origin, which is absent for
+pictures, scripts and links), and the relation between the two (Sec-Fetch-Site, which
+browsers omit for unencrypted connections to other machines). A web page cannot change
+any of these headers.
 """
 
 import errno
@@ -17,15 +17,15 @@ import socket
 from websockets.http11 import Request
 
 _MOST_PORTS = 1000
-# A name or an address, optionally with a port, in the form that browsers send: lower
+# A name or an address, optionally with a port, in the form that browsers send: in lower
 # case and without a user name.
 _HOST = re.compile(
     r"(?:\[(?P<address>[0-9a-f:.]+(?:%[a-z0-9._~-]+)?)\]|(?P<name>[a-z0-9._-]+))(?::[0-9]{0,5})?"
 )
-# Values of Sec-Fetch-Site for requests of the viewer's own page, and for addresses that
-# the user typed or opened from a bookmark.
+# Values of Sec-Fetch-Site for requests of the viewer's own web page, and for addresses
+# that the user typed or opened from a bookmark.
 _OWN_SITES = ("same-origin", "none")
-# Paths of the page that links on other sites may open.
+# Paths of the web page. Links on other sites may open them.
 _PAGE_PATHS = ("/", "/index.html")
 
 
@@ -33,15 +33,15 @@ class Gate:
     """Listens at one address of this machine, and decides which requests are answered.
 
     Args:
-        host: Address on which to listen; ``"0.0.0.0"`` means all addresses of this
+        host: Address on which to listen. ``"0.0.0.0"`` means all addresses of this
             machine.
-        port: Port on which to listen; if it is taken, the next free port is used.
+        port: Port on which to listen. If it is in use, the next free port is used.
 
     Attributes:
         socket: The socket that listens.
         port: The port on which the socket listens.
         url: The address for a browser. If other machines can connect, it contains a
-            secret; requests without the secret are refused.
+            secret, and requests without the secret are refused.
         is_secret: Whether the address contains a secret.
 
     Raises:
@@ -53,8 +53,8 @@ class Gate:
         self.port = int(self.socket.getsockname()[1])
         address = ipaddress.ip_address(self.socket.getsockname()[0].partition("%")[0])
         self._names = {"localhost", host.lower(), str(address)}
-        # A machine that listens on all addresses does not know all its names, so only
-        # the token decides.
+        # A machine that listens on all addresses does not know all of its names, so
+        # only the token decides.
         self._has_any_name = address.is_unspecified
         self._token = ""
         if not address.is_loopback:
@@ -70,8 +70,8 @@ class Gate:
             self.url += f"/{self._token}/"
 
     def refusal(self, request: Request) -> str | None:
-        """Return the reason why a request is refused; None if it is accepted. The token
-        is removed from the path of an accepted request."""
+        """Return the reason why a request is refused, or None if it is accepted. The
+        token is removed from the path of an accepted request."""
         headers = request.headers
         texts = (request.path, *(value for _, value in headers.raw_items()))
         if not all(text.isascii() for text in texts):
@@ -97,10 +97,10 @@ class Gate:
         return None
 
     def _knows(self, host: str) -> bool:
-        """Return whether a Host header is a loopback address or the host on which the
+        """Return whether a Host header is a loopback address, or the host on which the
         viewer listens.
 
-        Any other name could belong to a hostile site that makes it point to this
+        Any other name could belong to a malicious site that makes it point to this
         machine.
         """
         match = _HOST.fullmatch(host)
@@ -116,8 +116,8 @@ class Gate:
 
 
 def _opens_the_page(request: Request) -> bool:
-    """Return whether a request is for opening the page in a tab, from a link on another
-    site. Frames have another Sec-Fetch-Dest."""
+    """Return whether a request opens the web page in a tab, from a link on another
+    site. Requests from frames have another Sec-Fetch-Dest."""
     headers = request.headers
     is_navigation = headers.get_all("Sec-Fetch-Mode") == ["navigate"]
     is_tab = headers.get_all("Sec-Fetch-Dest") == ["document"]

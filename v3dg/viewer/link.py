@@ -1,5 +1,5 @@
-"""Reads the camera in a link to the viewer's page. `page/link_state.js` writes it
-behind the `#` of the page's address."""
+"""Reads the camera in a link to the viewer's web page. `page/link_state.js` writes it
+after the `#` of the address."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 from v3dg._numbers import check
 from v3dg.viewer.view import View
 
-_FOV_BOUNDS = (1.0, 170.0)  # degrees; the same limits as in the page
+_FOV_BOUNDS = (1.0, 170.0)  # degrees; the limits are those of the web page
 _DEFAULT_FOV = 45.0
 
 
@@ -17,9 +17,9 @@ class LinkedPlace:
     """The camera in a link.
 
     Attributes:
-        view: The viewpoint. Its aspect ratio is 1, because links do not contain it.
-        focus: (3,) the point around which the camera orbits, in world units; None if
-            the link does not contain it.
+        view: The viewpoint. Its aspect ratio is 1, because links do not contain one.
+        focus: (3,) the point that the camera orbits, in world units. None if the link
+            does not contain it.
     """
 
     view: View
@@ -27,7 +27,8 @@ class LinkedPlace:
 
 
 def read_link(link: str) -> LinkedPlace:
-    """Read the camera in a link, which is the whole address or the part after its `#`.
+    """Read the camera in a link. The link is the whole address, or the part after its
+    `#`.
 
     Raises:
         ValueError: The link has no camera, or a value in it is invalid.
@@ -54,7 +55,7 @@ def read_link(link: str) -> LinkedPlace:
 
 
 def _numbers(values: dict[str, str], name: str, count: int) -> list[float]:
-    """Return the numbers of a value in a link, which are separated by commas."""
+    """Return the comma-separated numbers of a value in a link."""
     text = values.get(name)
     expected = "the address of the viewer's page, with"
     check("link", text is not None, f"{expected} at= and turn= after #, got one without {name}=")

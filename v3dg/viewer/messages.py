@@ -1,4 +1,4 @@
-"""Messages from a page to the viewer: JSON objects of the types below, with bounded
+"""Messages from a web page to the viewer: JSON objects of the types below, with bounded
 numbers. Anything else is rejected.
 
 `tests/support/page_protocol.py` generates the page's types from this module and
@@ -18,13 +18,13 @@ from v3dg.viewer.pacing import Request, scaled
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View
 
-# Maximum length in px of the longer side of a picture, for any window size that the
+# Maximum length, in px, of the longer side of a picture, whatever window size the web
 # page sends.
 MOST_PIXELS = 4096
-# Maximum size of a message in bytes. The page sends dropped files in pieces.
+# Maximum size of a message in bytes. The web page sends dropped files in pieces.
 MOST_BYTES = 1 << 20
-# Maximum duration of a path in seconds. It is limited because all views are computed
-# before the work can be stopped.
+# Maximum duration of a path in seconds. There is a maximum because all views are
+# computed before the work can be stopped.
 MOST_PATH_SECONDS = 600.0
 MOST_TOLERANCE = 1e6
 MOST_GAUSSIANS = 1 << 40
@@ -37,7 +37,7 @@ LIMITS = Limits(
     path_seconds=MOST_PATH_SECONDS,
 )
 
-# The bounds also exclude NaN.
+# The limits also exclude NaN.
 _Number = Annotated[float, msgspec.Meta(ge=-1e15, le=1e15)]
 _Vector = tuple[_Number, _Number, _Number]
 _Quaternion = tuple[_Number, _Number, _Number, _Number]
@@ -118,7 +118,7 @@ class Pick(msgspec.Struct, tag="pick", forbid_unknown_fields=True):
     Attributes:
         at: The point, as fractions of the width and the height from the upper left
             corner.
-        instance: The instance to describe; then the point is ignored.
+        instance: The instance to describe. If it is given, the point is ignored.
     """
 
     look: Look
@@ -144,7 +144,7 @@ class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
     Attributes:
         what: The file: a picture, a film of the path, its cameras, or the scene.
         look: The content and the size of pictures.
-        up: The axis that points up, for the file of a scene; null for other directions.
+        up: The axis that points up, for a scene file. It is null for other directions.
         path: The views of the path, each with the seconds since the previous view.
     """
 
@@ -163,8 +163,8 @@ class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
 
 
 class Crop(msgspec.Struct, tag="crop", forbid_unknown_fields=True):
-    """Requests a new asset with the gaussians of a bundle whose centres are inside a
-    box, or with all others.
+    """Requests a new asset from the gaussians of a bundle whose centres are inside a
+    box, or from all others.
 
     Attributes:
         instance: An instance of the bundle.

@@ -1,5 +1,5 @@
-"""Decides the size and the time of pictures: small ones while the camera moves, then
-larger and larger ones."""
+"""Decides the size and the time of pictures. While the camera moves, they are small;
+then they become larger and larger."""
 
 import contextlib
 import math
@@ -16,19 +16,19 @@ from v3dg.viewer.view import View
 
 Size = tuple[int, int]
 
-# Target time in ms for one picture while the camera moves. A drag is then answered in
+# Target time, in ms, of one picture while the camera moves. A drag is then answered in
 # less than twice this time.
 TARGET_MS = 60.0
 # A larger picture is started if nothing has changed for this many seconds.
 REST_SECONDS = 0.15
 # While the camera rests, a picture waits this many seconds for missing pages. As long
-# as pages are missing, further pictures follow.
+# as pages are missing, more pictures follow.
 PAGES_SECONDS = 0.1
-# A draft that has taken this many seconds is abandoned when another picture is
+# If a draft has taken this many seconds, it is abandoned when another picture is
 # requested.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
-# The width of the smallest draft as a fraction of the full width. If drawing this draft
-# is still too slow, the tolerance is multiplied by up to the second number.
+# The width of the smallest draft as a fraction of the full width. If drawing it is
+# still too slow, the tolerance is multiplied, up to the second number.
 _SMALLEST = 1 / 4
 _COARSEST = 64.0
 # Sizes are rounded to this number of steps per factor of two, so that they do not
@@ -49,12 +49,12 @@ class Draft(NamedTuple):
 
 
 class Pacer:
-    """Chooses the size and the tolerance of a draft so that it meets the target time,
-    based on the times of earlier pictures.
+    """Chooses the size and the tolerance of a draft, so that it meets the target time.
+    The choice is based on the times of earlier pictures.
 
-    The model is that time is proportional to work, and work is the number of pixels
-    divided by the factor of the tolerance. Each picture updates the measured speed.
-    Even if the model is inaccurate, the choice converges to the target time.
+    The model assumes that time is proportional to work, where work is the number of
+    pixels divided by the factor of the tolerance. Each picture updates the measured
+    speed. Even if the model is inaccurate, the choice converges to the target time.
     """
 
     def __init__(self, target_ms: float = TARGET_MS) -> None:
@@ -77,7 +77,7 @@ class Pacer:
     def drew(self, draft: Draft, milliseconds: float) -> None:
         """Update the measured speed with the time of a picture."""
         speed = math.prod(draft.size) / draft.coarser / max(milliseconds, 0.1)
-        # A lower speed is adopted at once, a higher one only gradually.
+        # A lower speed is adopted immediately, a higher one only gradually.
         share = 1.0
         if speed > self._work_per_ms > 0:
             share = 0.3
@@ -90,17 +90,17 @@ class Pacer:
 
 
 def scaled(full: Size, scale: float) -> Size:
-    """Return a size in px multiplied by a factor; at least 1 x 1."""
+    """Return a size in px multiplied by a factor. It is at least 1 x 1."""
     return max(1, round(scale * full[0])), max(1, round(scale * full[1]))
 
 
 def finer_sizes(drawn: Size, full: Size) -> list[Size]:
-    """Return the sizes to draw after ``drawn``, each twice the previous one, up to
-    ``full``; empty if ``drawn`` is already that large."""
+    """Return the sizes to draw after ``drawn``, up to ``full``. Each has twice as many
+    px as the one before. If ``drawn`` is already that large, return none."""
     sizes = []
     width = drawn[0]
     while width < full[0]:
-        # A last step by less than a factor of 1.5 is not worth another picture.
+        # A last step by a factor of less than 1.5 is not worth another picture.
         if 3 * width >= full[0]:
             sizes.append(full)
             break
@@ -124,8 +124,8 @@ class Request(NamedTuple):
 
 
 class SendFrame(Protocol):
-    """Sends a picture to the page. ``number`` is that of its request, and ``is_final``
-    marks the last picture for that request."""
+    """Sends a picture to the web page. ``number`` is that of its request, and
+    ``is_final`` marks the last picture for the request."""
 
     def __call__(self, frame: Frame, number: int, *, is_final: bool) -> None: ...
 
@@ -134,10 +134,10 @@ class RenderLoop:
     """Draws the most recent request of a tab in a separate thread, as often and as
     large as time allows.
 
-    A request is answered by a small picture; if no other request arrives, larger ones
-    follow, up to the full size. A new request ends a larger picture at once. It also
-    ends a small picture that has already taken too long, and the next one is smaller.
-    The smallest picture is always finished, so that something is shown.
+    A request is answered by a small picture. If no other request arrives, larger ones
+    follow, up to the full size. A new request immediately ends a larger picture. It
+    also ends a small picture that has already taken too long, and the next one is
+    smaller. The smallest picture is always finished, so that something is shown.
 
     Args:
         send: Called in the loop's thread with each picture.
@@ -173,8 +173,8 @@ class RenderLoop:
             self._changed.notify()
 
     def close(self, seconds: float) -> bool:
-        """Stop drawing. Wait at most `seconds` for the thread, and return whether it
-        has ended."""
+        """Stop drawing. Wait at most `seconds` for the thread. Return whether it has
+        ended."""
         with self._changed:
             self._is_closed = True
             self._stop.request()
@@ -195,7 +195,7 @@ class RenderLoop:
             except Stopped:
                 pass
             except Exception as error:
-                # The loop continues after an error, and the tab shows the reason.
+                # After an error, the loop continues, and the tab shows the reason.
                 with contextlib.suppress(Exception):
                     self._fail(error)
 
@@ -238,7 +238,8 @@ class RenderLoop:
         try:
             return self._scene_view.frame(view, draft.size, settings, stop, self._steps)
         finally:
-            # A picture that was stopped would have taken at least this long.
+            # If the picture had not been stopped, it would have taken at least this
+            # long.
             self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
 
     def _draw_until_complete(self, request: Request) -> None:
@@ -255,8 +256,8 @@ class RenderLoop:
             self._send(frame, request.number, is_final=is_complete)
 
     def _draw_until_settled(self, request: Request, tolerance: float) -> None:
-        """Draw pictures until the tolerance, which approaches that of the budget in
-        steps, no longer changes."""
+        """Draw pictures until the tolerance no longer changes. It approaches the
+        tolerance of the budget in steps."""
         is_settled = False
         while not is_settled:
             stop = self._begin(0.0)
@@ -268,8 +269,8 @@ class RenderLoop:
             tolerance = frame.figures.tolerance
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
-        """Return the settings for pictures while the camera moves, without modes that
-        are too slow."""
+        """Return the settings for pictures while the camera moves. Modes that are too
+        slow are replaced."""
         draws_all = self._scene_view.draws_all_while_moving
         if not draws_all and (settings.split > 0 or settings.shows == "difference"):
             settings = replace(settings, shows="appearance", split=0.0)

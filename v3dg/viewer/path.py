@@ -12,8 +12,8 @@ from v3dg.rotations import normalised
 from v3dg.viewer.view import View
 
 _LEAST_SHARE = 1e-3
-"""Minimum share of the time between two views. Without it, equal views would have the
-same time, and the slope of the curve would be undefined."""
+"""Minimum fraction of the time between two views. Without it, equal views would have
+the same time, and the slope of the curve would be undefined."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class CameraPath:
     """A path through views.
 
     Attributes:
-        stops: Each view with the seconds since the previous view; those of the first
-            view are ignored.
+        stops: Each view, with the seconds since the previous view. The seconds of the
+            first view are ignored.
     """
 
     stops: Sequence[tuple[float, View]] = ()
@@ -32,8 +32,8 @@ class CameraPath:
         """Return the path through at least two views with a duration of ``seconds``.
 
         The speed is constant: the time between two views is proportional to the sum of
-        their distance and their angle, each as a share of the total along the path. If
-        all views are equal, so are the times.
+        their distance and their angle, each as a fraction of the total along the path.
+        If all views are equal, the times between them are equal, too.
         """
         rows = _rows(list(views))
         distances = np.linalg.norm(np.diff(rows[:, 4:7], axis=0), axis=1)
@@ -56,9 +56,9 @@ class CameraPath:
         first stop.
 
         Positions, rotations and fields of view follow cubic Hermite curves with the
-        slopes of Catmull-Rom splines for non-uniform times; rotations are normalised.
-        Times before the first stop give the first view; times after the last stop give
-        the last view.
+        slopes of Catmull-Rom splines for non-uniform times. Rotations are normalised.
+        Times before the first stop give the first view, and times after the last stop
+        give the last view.
 
         Raises:
             ValueError: The path is empty.
@@ -102,7 +102,7 @@ class CameraPath:
 
 
 def _shares(lengths: Floats) -> Floats:
-    """Return lengths as shares of their sum; zeros if the sum is zero."""
+    """Return lengths as fractions of their sum. If the sum is zero, return zeros."""
     total = lengths.sum()
     if total == 0:
         return np.zeros_like(lengths)
@@ -113,7 +113,7 @@ def _shares(lengths: Floats) -> Floats:
 def _rows(views: list[View]) -> Floats:
     """Return (K, 9): quaternion, position, field of view and aspect ratio of each view.
 
-    The sign of each quaternion is chosen so that it is closest to the previous one.
+    The sign of each quaternion is chosen such that it is closest to the previous one.
     """
     rows = np.array(
         [(*view.wxyz, *view.position, view.fov_y, view.aspect) for view in views], np.float64

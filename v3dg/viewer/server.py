@@ -1,4 +1,4 @@
-"""The viewer's web server. It serves the page, and connects each browser tab
+"""The viewer's web server. It serves the web page, and connects each browser tab
 separately."""
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
     from v3dg.viewer.answers import Hello
     from v3dg.viewer.tab import Tab
 
-# Maximum time in seconds that closing the server waits for threads.
+# Maximum time, in seconds, for which closing the server waits for threads.
 _CLOSE_SECONDS = 1.0
-# Maximum length in px of the longer side of a photograph, by the folder in the page's
+# Maximum length, in px, of the longer side of a photograph, by the folder in the
 # request.
 _PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
-# Errors of a connection are caused by its client, so they are logged and not printed in
-# the terminal.
+# Errors of a connection are caused by its client. Therefore they are logged, and not
+# printed in the terminal.
 _LOG = logging.getLogger(__name__)
 _LOG.addHandler(logging.NullHandler())
-# Media types of the files that are served. Files with other suffixes in the page's
+# Media types of the files that are served. Files with other suffixes in the web page's
 # folder are not served.
 _MEDIA_TYPES = {
     ".html": "text/html",
@@ -50,9 +50,9 @@ _MEDIA_TYPES = {
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
 }
-# Headers of every answer, including refusals and errors. Other pages cannot embed this
-# page in a frame, show its files, or access its window. This page runs only its own
-# files and connects to no other server.
+# Headers of every answer, including refusals and errors. Other web pages cannot embed
+# this one in a frame, show its files, or access its window. This web page only runs its
+# own files, and connects to no other server.
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -71,14 +71,14 @@ class Site:
     """The viewer as a web server, which runs from construction until `close`.
 
     Args:
-        name: Title of the page, and name of the files that it saves.
+        name: Title of the web page, and name of the files that it saves.
         cameras: Cameras by name, to which the user can jump.
         photographs: Files of the cameras' photographs, by the cameras' names.
         host, port: See `Gate`.
         tolerance, budget, background: Initial settings of a tab.
         up: (3,) direction in the world that points up.
-        asks_up: Whether ``up`` is only assumed; then the page asks the user.
-        edits_folder: Folder to which pages may write new assets; existing files are
+        asks_up: Whether ``up`` is only assumed. If so, the web page asks the user.
+        edits_folder: Folder to which web pages may write new assets. Existing files are
             never overwritten. If it is None, or if other machines can connect, the
             browser saves new assets.
 
@@ -134,8 +134,8 @@ class Site:
         self._start()
 
     def _allowed_folder(self, folder: Path | None) -> Path | None:
-        """Return the folder to which pages may write; None if other machines can
-        connect."""
+        """Return the folder to which web pages may write. Return None if other machines
+        can connect."""
         if folder is None or self.is_secret:
             return None
         return Path(folder).absolute()
@@ -152,7 +152,7 @@ class Site:
         is_serving.wait()
 
     def close(self) -> bool:
-        """Close all tabs and the server within about two seconds; return whether all
+        """Close all tabs and the server within about two seconds. Return whether all
         their threads have ended."""
         with contextlib.suppress(RuntimeError):  # the event loop may already be closed
             self._loop.call_soon_threadsafe(self._closing.set)
@@ -225,8 +225,8 @@ class Site:
                 self._tabs.discard(tab)
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the answer to a request for a file of the page; None for a request
-        that opens a WebSocket."""
+        """Return the answer to a request for a file of the web page. Return None for a
+        request that opens a WebSocket."""
         refusal = self._gate.refusal(request)
         if refusal is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, refusal)
@@ -250,8 +250,8 @@ class Site:
         return response
 
     def _photograph(self, place: str, side: int) -> bytes | None:
-        """Return the photograph of the camera with a number as JPEG; None if there is
-        none, or if it cannot be read."""
+        """Return the photograph of a camera, given by its number, as JPEG. Return None
+        if there is none, or if it cannot be read."""
         try:
             if not place.isdecimal():
                 return None
@@ -307,7 +307,7 @@ def _greeting(
 
 
 def _read_page() -> dict[str, bytes]:
-    """Return the content of the page's files, by name."""
+    """Return the content of the web page's files, by name."""
     folder = files("v3dg.viewer").joinpath("page")
     return {
         path.name: path.read_bytes()

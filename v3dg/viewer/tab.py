@@ -1,5 +1,5 @@
-"""The server's part of a browser tab: it executes the requests of a page and sends
-results to it."""
+"""The server's part of a browser tab. It executes the requests of a web page, and sends
+the results to it."""
 
 import contextlib
 import copy
@@ -45,8 +45,8 @@ _FINAL_QUALITY = 94
 _HALF_COLORS = 2
 _WHOLE_COLORS = 0
 _FPS = 30
-# Minimum weight of a gaussian in a pixel to be picked by a click. A gaussian with less
-# weight is hardly visible.
+# Minimum weight of a gaussian in a pixel that is clicked. A gaussian with less weight
+# is hardly visible, so it is not picked.
 _LEAST_WEIGHT = 0.05
 _SECONDS_BETWEEN_PROGRESS = 0.2
 
@@ -54,16 +54,16 @@ _Send = Callable[[str | bytes], None]
 
 
 class Tab:
-    """The server's part of a page that is connected to a `Site`, until `close`.
+    """The server's part of a web page that is connected to a `Site`, until `close`.
 
     Args:
-        scene_view: The scene that is shown, until a file is dropped onto the page.
-        name: Name of the files that the page saves.
-        send: Sends text or binary data to the page. It waits until they are sent,
-            except in the server's thread.
+        scene_view: The scene that is shown, until a file is dropped onto the web page.
+        name: Name of the files that the web page saves.
+        send: Sends text or binary data to the web page. It waits until the data is
+            sent, except in the server's thread.
         moved: Called with the scene view after an instance was moved.
         edits_folder: Folder to which new assets are written. If it is None, or if the
-            shown file was dropped onto the page, the browser saves them.
+            shown file was dropped onto the web page, the browser saves them.
     """
 
     def __init__(
@@ -90,8 +90,8 @@ class Tab:
         self._missing_bytes = 0
 
     def close(self, seconds: float) -> bool:
-        """Stop drawing and saving. Wait at most `seconds` for each thread, and return
-        whether all have ended."""
+        """Stop drawing and saving. Wait at most `seconds` for each thread. Return
+        whether all threads have ended."""
         has_ended = all([self._loop.close(seconds), self._exporter.close(seconds)])
         if has_ended and self._folder is not None:
             self._folder.cleanup()
@@ -103,7 +103,7 @@ class Tab:
             self._loop.ask(self._look.request())
 
     def take(self, data: str | bytes) -> None:
-        """Execute a message from the page.
+        """Execute a message from the web page.
 
         Raises:
             ValueError: The message is invalid.
@@ -130,7 +130,7 @@ class Tab:
                 self._begin_file(message)
 
     def describe_scene(self) -> answers.Scene:
-        """Return the description of the subject that the page needs."""
+        """Return the description of the subject that the web page needs."""
         scene_view = self.scene_view
         bundles = scene_view.scene.bundles
         num_missing = np.arange(4)
@@ -219,13 +219,13 @@ class Tab:
         try:
             self._tell(self._find(message))
         except Exception as error:
-            with contextlib.suppress(Exception):  # the page may be closed
+            with contextlib.suppress(Exception):  # the web page may be closed
                 self._tell(answers.Notice(self.scene_view.explain(error)))
         finally:
             self._picking.release()
 
     def _find(self, message: messages.Pick) -> answers.Picked:
-        """Return the instance that the page has named, or the one at a point of its
+        """Return the instance that the web page has named, or the one at a point of its
         picture."""
         if message.instance is not None:
             return self._describe_instance(message.instance)
@@ -350,7 +350,7 @@ class Tab:
         return number
 
     def _begin_file(self, message: messages.Open) -> None:
-        """Create the file for the binary data that follows, in a folder that is removed
+        """Create a file for the binary data that follows. Its folder is removed
         together with the tab."""
         self._folder = self._folder or tempfile.TemporaryDirectory(prefix="v3dg_")
         if self._dropped is not None:
@@ -377,7 +377,7 @@ class Tab:
                 subject = Bundle.open(path)
             else:
                 subject = read_asset(path)
-        # Pages must not learn the names of folders on this machine.
+        # Web pages must not get the names of folders on this machine.
         except (OSError, ValueError) as error:
             raise ValueError(str(error).replace(f"{path.parent}{os.sep}", "")) from None
         scene_view = SceneView(subject, device=self.scene_view.device)

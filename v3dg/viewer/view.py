@@ -1,5 +1,5 @@
-"""Views: viewpoints without a size in pixels, as browsers use them, and the pinhole
-cameras for pictures of them."""
+"""Views are viewpoints without a size in pixels, as browsers use them. This module also
+makes the pinhole cameras for pictures of views."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,8 +15,8 @@ class View:
     """A viewpoint: a camera without a size in pixels.
 
     Attributes:
-        wxyz: Rotation from camera (x right, y down, z forward) to world as a
-            quaternion, which need not be normalised.
+        wxyz: Rotation from the camera's axes (x right, y down, z forward) to the world,
+            as a quaternion, which need not be normalised.
         position: Position of the camera in world units.
         fov_y: Vertical field of view in radians.
         aspect: Width divided by height.
@@ -53,6 +53,6 @@ def look_at(
     eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float
 ) -> View:
     """Return the view from ``eye`` that has ``target`` in the middle and ``up``
-    upwards."""
+    pointing upwards."""
     of_camera = View.of_camera(Camera.look_at(eye, target, up, width=1, height=1))
     return replace(of_camera, fov_y=fov_y, aspect=aspect)

@@ -88,7 +88,7 @@ def rasterize_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
         row |= gsplat_peer(evaluation, gaussians, camera, picture.color)
     elif evaluation.device == "cpu":
         row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
-    # Converts the asset to the renderer's layout, once.
+    # The asset is converted to the renderer's layout once.
     renderer = Renderer(gaussians, device=evaluation.device)
     timed = time_ms(
         lambda: renderer.render(camera).stats, evaluation.device, evaluation.settings.repeats

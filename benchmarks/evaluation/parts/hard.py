@@ -1,4 +1,4 @@
-"""Assets that are hard for level of detail: hair-thin lines, a sky of huge soft
+"""Assets that are hard for level of detail: lines as thin as hair, a sky of huge soft
 gaussians, and a dense tree."""
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
                 if share in (None, _SHARES[-1]) or ours_count > wanted:
                     text = f"{ours_count / count:.0%}"
                     strip += [(f"ours, {text}", ours), (f"merged, {text}", theirs)]
-                # The cut is already the coarsest one: the eye is inside the balls of
-                # the remaining groups.
+                # The cut is already the coarsest one that selection allows, because the
+                # eye is inside the balls of the remaining groups.
                 if ours_count > wanted:
                     break
             strip[0] = f"{name}, {where}: truth", truth

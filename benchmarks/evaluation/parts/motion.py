@@ -1,4 +1,4 @@
-"""Steadiness: a zoom through the scene, and the changes between consecutive frames
+"""Steadiness: the changes between consecutive frames of a zoom through the scene,
 beyond those of the reference."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Original views (table 5 of the paper): close views, for which the asset was trained
-and in which levels must lose nothing."""
+"""Original views (table 5 of the paper). These are close views, as in training. Levels
+must lose nothing there."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Does a fade between levels remove pops? Bundles on slow paths, in comparison with the
-hard cut and with all gaussians.
+"""Measures whether a fade between levels removes pops. Bundles on slow paths are drawn
+with fades, with the hard cut, and with all gaussians.
 
 The hard cut is drawn twice: at the tolerance of the fade, and at a lower tolerance at
 which it has as many gaussians as the fade. A constant cut, selected in the middle of

@@ -1,5 +1,5 @@
-"""Does a fade remove pops in scenes? Scenes are thousands of instances, crowds of
-captured assets, and rooms seen from inside.
+"""Measures whether a fade removes pops in scenes: in thousands of instances, in crowds
+of captured assets, and in rooms seen from inside.
 
 A picture is divided into windows. The camera of each window drifts towards and away
 from the object in the middle of the window, so slowly that no other motion hides a pop.

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.studies.mass`; measure.py says what it does."""
+"""The command `python -m benchmarks.studies.mass`, which runs measure.py."""
 
 import tyro
 

@@ -1,5 +1,5 @@
-"""Assets of thin or faint gaussians, made from a seed: what loses mass first when
-levels are made."""
+"""Random assets of thin or faint gaussians, whose levels are the first to lose alpha
+and colour."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import v3dg
 
 Floats = npt.NDArray[np.float64]
 
-_SH_CONSTANT = 0.28209479177387814  # Y_00
+_SH_CONSTANT = 0.28209479177387814  # the value of the SH function of degree 0
 
 
 def make_cloud() -> v3dg.Gaussians:
@@ -111,7 +111,7 @@ def _random_quats(rng: np.random.Generator, count: int) -> Floats:
 
 
 def _quats_along(direction: Floats) -> Floats:
-    """Return rotations that turn the x axis into (N, 3) unit directions."""
+    """Return rotations that map the x axis to unit directions (N, 3)."""
     quats = np.column_stack(
         [1 + direction[:, 0], np.zeros(len(direction)), -direction[:, 2], direction[:, 1]]
     )
@@ -121,7 +121,7 @@ def _quats_along(direction: Floats) -> Floats:
 def _gaussians(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, colors: Floats
 ) -> v3dg.Gaussians:
-    """Return gaussians of SH degree 0 from their colours in [0, 1]."""
+    """Return gaussians of SH degree 0 with these colours in [0, 1]."""
     sh = ((colors - 0.5) / _SH_CONSTANT)[:, None, :]
     arrays = (array.astype(np.float32) for array in (means, quats, scales, opacities, sh))
     return v3dg.Gaussians(*arrays)

@@ -1,13 +1,14 @@
-"""Total alpha and colour of cuts over those of the asset, from near and far.
+"""Total alpha and colour of cuts relative to those of the asset, from near and far.
 
     python -m benchmarks.studies.mass donut.ply cloud grass -o mass
 
-Assets are files, or names of `fuzzy`. Each is seen from six sides at distances of 4 to
-128 radii, in pictures of its ball with the focal length of 1,024 px for 50 degrees. The
-asset at one sample a pixel, the cut at the default tolerance and, with `--levels`, each
-level alone are compared with the asset at four by four samples, or eight by eight in
-small pictures. `--stages` also has levels that are merged and not fitted, that are
-fitted by the differences of single pixels only, and that are refined.
+Assets are files, or names of assets in `fuzzy`. Each is seen from six sides at
+distances of 4 to 128 radii. The focal length is that of 1,024 px for 50 degrees, and
+the pictures are as large as the asset's ball. The reference is the asset at 4 x 4
+samples per pixel, or 8 x 8 in small pictures. It is compared with the asset at one
+sample per pixel, with the cut at the default tolerance and, with `--levels`, with each
+level alone. `--stages` adds levels that are merged but not fitted, levels that are
+fitted only by differences of single pixels, and levels that are refined.
 """
 
 from __future__ import annotations
@@ -39,31 +40,33 @@ Stage = Literal["merged", "by pixels", "fitted", "refined"]
 _FOCAL_PX = 512 / math.tan(math.radians(25))
 _BALL_SHARE = 0.995  # fraction of the gaussians; the others may be far away
 _BORDER_PX = 6
-_FEW_PX = 128  # px per side; smaller pictures have the finer truth
+_FEW_PX = 128  # px per side; smaller pictures have a reference with more samples
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_TURNS = 4  # of the six sides, for small pictures, whose single samples are noisy
+# number of rotations of the six sides for small pictures, whose single samples are
+# noisy
+_TURNS = 4
 _SIDES = [*np.eye(3), *-np.eye(3)]
 
 
 @dataclass
 class Config:
     assets: tyro.conf.Positional[tuple[str, ...]]
-    """Files, or names of `fuzzy`."""
+    """Files, or names of assets in `fuzzy`."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File of the results, without its suffix."""
+    """File for the results, without suffix."""
     distances: tuple[float, ...] = (4, 8, 16, 32, 64, 128)
-    """Radii."""
+    """Distances of the camera in radii."""
     stages: tuple[Stage, ...] = ("fitted",)
-    """Which levels are measured."""
+    """The stages whose levels are measured."""
     refine: int = 2_000
-    """Pictures of the refinement."""
+    """Number of pictures of the refinement."""
     levels: bool = False
-    """Also measure each level alone."""
+    """Whether each level is also measured alone."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
 class Totals(NamedTuple):
-    """Sums over a picture, and the picture as it is shown."""
+    """Sums over a picture, and the picture in 8-bit colours."""
 
     alpha: float
     color: npt.NDArray[np.float64]  # (3,)
@@ -71,7 +74,7 @@ class Totals(NamedTuple):
 
 
 class View(NamedTuple):
-    """A camera, and the asset as it should look there."""
+    """A camera, and its reference picture of the asset."""
 
     distance: float
     camera: v3dg.Camera
@@ -87,7 +90,7 @@ def read(name: str) -> v3dg.Gaussians:
 
 def cameras_of(asset: v3dg.Gaussians, distance: float) -> Iterator[v3dg.Camera]:
     """Yield views of the ball of nearly all gaussians from six sides, at a distance in
-    radii; from more in small pictures."""
+    radii. For small pictures, yield more views."""
     means = asset.means.astype(np.float64)
     center = np.quantile(means, [0.01, 0.99], axis=0).mean(axis=0)
     radius = float(np.quantile(np.linalg.norm(means - center, axis=1), _BALL_SHARE))
@@ -108,7 +111,7 @@ def cameras_of(asset: v3dg.Gaussians, distance: float) -> Iterator[v3dg.Camera]:
 
 
 def totals(image: Image, samples: int = 1) -> Totals:
-    """Return the sums of a picture that is drawn larger by `samples`."""
+    """Return the sums of a picture that is drawn `samples` times as large."""
     color = _device.to_host(image.color)
     alpha = _device.to_host(image.alpha)
     shown = box_downsample(color.clip(0, 1), samples)
@@ -121,7 +124,7 @@ def totals(image: Image, samples: int = 1) -> Totals:
 
 
 def views_of(config: Config, asset: v3dg.Gaussians) -> list[View]:
-    """Draw the truth of all views."""
+    """Draw the reference pictures of all views."""
     views = []
     for distance in config.distances:
         for camera in cameras_of(asset, distance):
@@ -139,7 +142,7 @@ def views_of(config: Config, asset: v3dg.Gaussians) -> list[View]:
 
 
 def compared(test: Totals, truth: Totals) -> Row:
-    """Return the ratios of sums, and FLIP."""
+    """Return the ratios of the sums to those of the reference, and FLIP."""
     ratio = test.color / truth.color
     luminance = float(test.color @ _LUMINANCE) / float(truth.color @ _LUMINANCE)
     return {
@@ -153,8 +156,8 @@ def compared(test: Totals, truth: Totals) -> Row:
 def rows_of(
     config: Config, views: list[View], subject: v3dg.Bundle | v3dg.Gaussians, level: int | None
 ) -> Iterator[Row]:
-    """Yield means over the views of each distance: of the whole asset, of the cut at
-    the default tolerance, or of one level alone."""
+    """Yield means over the views of each distance, for the whole asset, the cut at the
+    default tolerance, or one level alone."""
     for distance, group in itertools.groupby(views, lambda view: view.distance):
         found: list[Row] = []
         for _, camera, truth in group:
@@ -171,7 +174,7 @@ def rows_of(
 
 
 def bundle_of(config: Config, asset: v3dg.Gaussians, stage: Stage) -> v3dg.Bundle:
-    """Build the levels as far as a stage."""
+    """Return the levels after one of the stages."""
     build = BuildConfig()
     if stage == "merged":
         build = replace(build, steps=0)
@@ -186,7 +189,7 @@ def bundle_of(config: Config, asset: v3dg.Gaussians, stage: Stage) -> v3dg.Bundl
 
 
 def measure(config: Config, name: str) -> Iterator[Row]:
-    """Yield the rows of an asset."""
+    """Yield the results for an asset."""
     asset = read(name)
     views = views_of(config, asset)
     about: Row = {"asset": Path(name).name.split(".")[0]}

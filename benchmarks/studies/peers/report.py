@@ -151,7 +151,7 @@ def page(results: list[Row]) -> str:
 
 
 def latest(rows: list[Row]) -> list[Row]:
-    """Return the rows without those that a later row replaces."""
+    """Return the rows, without rows that are replaced by later rows."""
     keys = ("job", "renderer", "scene", "view", "width", "filter_px2")
     return list({tuple(row[name] for name in keys): row for row in rows}.values())
 

@@ -3,11 +3,11 @@
     python -m benchmarks.studies.refined.qualities --donut donut.ply
     --layout donutsea.json --assets statue.sog -o qualities
 
-Assets are the donut, heaps of 11 and of 44 of them, and named files. Each is built in
-each quality, and FLIP of cuts is compared with that of the draft at equal counts
-(steps.py). With a layout of donuts, its pictures tell how few gaussians in the frustum
-reach the FLIP of the draft at a tolerance of 9.4 px², and how long frames take that
-stop at a thousandth of the light, and by the tolerance of their cut.
+Assets are the donut, heaps of 11 and of 44 donuts, and named files. Each asset is built
+in each quality. FLIP of cuts is compared with that of the draft at equal counts
+(steps.py). With a layout of donuts, the study also measures how many gaussians in the
+frustum reach the FLIP that the draft has at a tolerance of 9.4 px². It times frames at
+the tolerance of the cut, whose pixels stop at the default transmittance and at 0.001.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Config:
     most_for_best: int = 200_000
     """The largest asset that is built in the best quality."""
     seconds: float = 90
-    """No asset is begun after this time."""
+    """Time in seconds after which no further asset is begun."""
     device: Literal["cpu", "cuda"] = "cuda"
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
 
@@ -72,7 +72,7 @@ def qualities_of(config: Config, asset: v3dg.Gaussians) -> list[Quality]:
 def built(
     config: Config, asset: v3dg.Gaussians, quality: Quality | None
 ) -> tuple[v3dg.Bundle, float]:
-    """The bundle, and the seconds of its build."""
+    """Return the bundle and the seconds of its build."""
     start = time.perf_counter()
     bundle = v3dg.build_bundle(asset, device=config.device, progress=False, quality=quality)
     return bundle, round(time.perf_counter() - start, 3)
@@ -86,7 +86,7 @@ def measured(
     judges: Judges,
     results: steps.Results,
 ) -> dict[Quality, v3dg.Bundle]:
-    """Add the rows of one asset; return its bundles by quality."""
+    """Record the results of one asset; return its bundles by quality."""
     of_steps = steps.Config(config.donut, views=1, device=config.device)
     study = steps.Study(of_steps, name, asset, folder)
     bundles: dict[Quality, v3dg.Bundle] = {}
@@ -102,7 +102,7 @@ def measured(
 
 
 def scene_of(layout: Path, donut: v3dg.Bundle) -> tuple[v3dg.Scene, dict[str, v3dg.Camera]]:
-    """The scene of a layout of donuts, and its cameras."""
+    """Return the scene of a layout of donuts, and its cameras."""
     name = json.loads(layout.read_text())["asset"]
     return read_scene(layout, bundles={name: donut})
 
@@ -127,8 +127,8 @@ def scene_pictures(
 def compare_scenes(
     config: Config, layout: Path, bundles: dict[Quality, v3dg.Bundle], judges: Judges
 ) -> Iterator[Row]:
-    """Yield, for each quality, means over the cameras at each tolerance, and the
-    gaussians that reach the FLIP of the draft."""
+    """Yield, for each quality, the means over the cameras at each tolerance, and the
+    number of gaussians that reach the FLIP of the draft."""
     means: dict[tuple[Quality, float], list[Row]] = {}
     pictures = scene_pictures(config, layout, bundles)
     for (labels, _, _), errors_of_picture in judges.measured(pictures, errors):
@@ -171,7 +171,7 @@ def frame_times(config: Config, layout: Path, bundle: v3dg.Bundle) -> Iterator[R
 def measure(config: Config, folder: Path, judges: Judges) -> None:
     results = steps.Results(config.output, config.device, config.seconds, {})
     donut = v3dg.read_asset(config.donut)
-    built(config, donut, None)  # loads kernels
+    built(config, donut, None)  # a build that loads the kernels first
     bundles = measured(config, "donut", donut, folder, judges, results)
     assets = {path.stem: v3dg.read_asset(path) for path in config.assets}
     for count in config.heaps:

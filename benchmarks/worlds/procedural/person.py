@@ -279,7 +279,7 @@ def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Gene
     comb = np.stack(
         [np.sign(at[:, 0] - parting) * 0.6, 0.45 + 0.3 * at[:, 1] / 0.1, np.full(k, -0.6)], -1
     )
-    # Tangential to the scalp.
+    # Makes the directions tangential to the scalp.
     comb -= normals * np.sum(comb * normals, 1, keepdims=True)
     stray = 0.10 * rng.standard_normal((k, 3)) + 0.8 * (lock - 0.5)[:, None] * np.roll(
         normals, 1, axis=1

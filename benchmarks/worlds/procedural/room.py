@@ -1,5 +1,5 @@
-"""A furnished room like a captured one: millions of flat gaussians on walls and
-furniture, with clutter and a few floaters."""
+"""A furnished room that resembles a captured one: millions of flat gaussians on walls
+and furniture, with clutter and a few floaters."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from benchmarks.worlds.procedural._light import SH_C0
 from benchmarks.worlds.procedural._parts import Array, unit
 from v3dg.gaussians import Gaussians
 
-SIZE = np.array([8.0, 6.0, 2.8])  # metres; the floor is at z = 0, its middle at the origin
+SIZE = np.array([8.0, 6.0, 2.8])  # in metres; the middle of the floor is the origin
 _FURNITURE = 26
 _CLUTTER = 320
-_FLOATERS = 0.004  # fraction of the gaussians that are on no surface
-_LOOKS = 1 << 14  # different dependences of the colour on the view
+_FLOATERS = 0.004  # fraction of the gaussians that float in the air
+_LOOKS = 1 << 14  # number of different dependences of colours on the view
 
 
 @dataclass(frozen=True)
 class _Box:
     """A box on the floor or on furniture, turned around z."""
 
-    low: Array  # (3,) middle of its lower side
+    low: Array  # (3,) centre of the lower side
     size: Array  # (3,)
-    turn: float  # radians
-    colour: Array  # (3,) display
+    turn: float  # in radians
+    colour: Array  # (3,) in display values
 
 
 @dataclass(frozen=True)
 class _Faces:
-    """F rectangles."""
+    """The rectangles that form the surfaces of the room."""
 
     corner: Array  # (F, 3)
     edges: Array  # (F, 2, 3)
@@ -109,7 +109,8 @@ def _faces_of(boxes: list[_Box]) -> _Faces:
 
 
 def _texture(means: Array, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return (n, 1) differences of brightness: waves of many sizes."""
+    """Return random differences of brightness (n, 1), the sum of waves of many
+    sizes."""
     total = np.zeros(len(means), np.float32)
     for octave in range(8):
         direction = rng.normal(size=3) * 3.0 * 1.7**octave
@@ -119,15 +120,16 @@ def _texture(means: Array, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def _turned(faces: _Faces, which: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Return quaternions that turn z to the normals of faces, and x anywhere."""
+    """Return quaternions that rotate z to the normals of faces, and x to random
+    directions."""
     normals = unit(np.cross(faces.edges[:, 0], faces.edges[:, 1]))
     noise = rng.standard_normal((len(which), 3), dtype=np.float32)
     normal = unit(normals[which] + 0.05 * noise)
     half = normal + np.array([0, 0, 1])
     half[np.linalg.norm(half, axis=1) < 1e-6] = [1, 0, 0]
     half = unit(half)
-    # A turn around z, then the half turn around `half`, which exchanges z and the
-    # normal.
+    # A rotation about z, followed by half a turn about `half`, which exchanges z and
+    # the normal.
     angle = rng.uniform(0, np.pi, len(which))
     cos = np.cos(angle)
     sin = np.sin(angle)

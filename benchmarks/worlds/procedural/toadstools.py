@@ -161,7 +161,8 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     offset = rng.uniform(0, 30, 3)
 
     def cap_profile(t: Array) -> tuple[Array, Array]:
-        # Radians; the rim is at pi/2, and the edge beyond it turns inwards.
+        # In radians. The rim of the cap is at pi/2, and the edge beyond it turns
+        # inwards.
         a = t * 1.78
         return radius * np.sin(a) ** 0.92, dome * np.cos(a) * np.where(a > np.pi / 2, 0.45, 1.0)
 
@@ -340,7 +341,7 @@ def _grass(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 @dataclass
 class _Flower:
-    """A kind of flower. The unit of length is the radius of the tuft."""
+    """A kind of flower. Lengths are relative to the radius of the tuft."""
 
     petals: int
     rows: int  # number of gaussians along a petal
@@ -648,7 +649,7 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Arra
 
     rim = spacing * np.sqrt(max(count, 7) * np.sqrt(0.75) / np.pi)
     waves = rng.uniform(0, 2 * np.pi, (2, 3))
-    # Radians per unit of length.
+    # Wave numbers in radians per unit of length.
     pitch = np.array([[0.23, 0.11], [-0.13, 0.27], [0.31, -0.19]])
     phase = plane @ pitch.T + waves[0]
     origin = np.sin(waves[0]).sum()

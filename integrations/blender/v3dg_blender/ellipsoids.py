@@ -23,7 +23,7 @@ def material() -> bpy.types.Material:
     if NAME in bpy.data.materials:
         return bpy.data.materials[NAME]
     result = bpy.data.materials.new(NAME)
-    if result.node_tree is None:  # before 5.0
+    if result.node_tree is None:  # needed before Blender 5.0
         result.use_nodes = True
     tree = result.node_tree
     tree.nodes.clear()

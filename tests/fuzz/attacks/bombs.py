@@ -98,7 +98,7 @@ def sog_of_many_entries(rng):
 
 
 def streamed_with_repeated_names(rng):
-    """One folder is named many times; its pictures are constant, or small."""
+    """One folder is listed many times. Its pictures are constant or small."""
     good = streamed(0, names=["0/meta.json"] * rng.choice((300, 3000, 20_000)))
     side = rng.choice((0, 250, 2000))
     if not side:
@@ -123,7 +123,7 @@ def streamed_with_deep_tree(rng):
 
 
 def streamed_with_overlapping_runs(rng):
-    """All leaves name the same gaussians."""
+    """All leaves refer to the same gaussians."""
     good = streamed(1)
     index = json.loads(good.content)
     index["tree"]["children"] *= rng.choice((40, 5000))
@@ -149,7 +149,7 @@ def spz_with_a_long_tail(rng):
 
 
 def spz_of_long_frames(rng):
-    """zstd compresses zeros better than any deflate."""
+    """zstd compresses zeros better than deflate does."""
     import zstandard
 
     count, streams = rng.choice((1 << 16, 1 << 22)), []
@@ -196,7 +196,7 @@ def checkpoint_of_expanded_tensors(rng):
 
 
 def checkpoint_of_overlapping_tensors(rng):
-    """Every number of the file is in each tensor, and at many places of it."""
+    """Every tensor contains all numbers of the file, at many positions."""
     tensors, base = _tensors(rng, 1 << 18), torch.rand((1 << 18) + 64)
     for name in rng.sample(list(tensors), rng.randrange(1, 7)):
         tensors[name] = base.as_strided(tensors[name].shape, [1] * tensors[name].ndim)
@@ -277,7 +277,7 @@ def scene_of_bundles_in_turn(rng):
 
 
 def scene_of_many_bundles(rng):
-    """The scene names one file by thousands of names."""
+    """The scene refers to one file by thousands of different names."""
     names = {f"b{i}": rng.choice(("a.v3dg", "./a.v3dg")) for i in range(rng.choice((500, 5000)))}
     instances = [{"bundle": name, "position": [0, 0, 0]} for name in names]
     document = {"format": "v3dg-scene", "version": 1, "bundles": names, "instances": instances}
@@ -321,7 +321,7 @@ def picture_that_claims(rng):
 
 
 def picture_of_another_program(rng):
-    """These are files that Pillow passes to other programs, or reads with plugins."""
+    """Pillow passes such files to other programs, or reads them with plugins."""
     eps = (
         b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
         b"0 0 8 8 rectfill showpage\n%%EOF\n"
@@ -367,7 +367,7 @@ BOMBS = (
 
 
 def written_with_constants(rng, folder):
-    """Assets that are largely constant must be read back after they were written."""
+    """Assets whose values are mostly equal must be readable after they were written."""
     count, degree = rng.choice((1, 2, 300, 20_000, 70_000)), rng.choice((0, 0, 1))
     asset = random_gaussians(np.random.default_rng(rng.getrandbits(32)), count, degree)
     for name in rng.sample(("means", "quats", "scales", "opacities", "sh"), rng.randrange(6)):

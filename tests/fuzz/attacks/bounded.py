@@ -1,9 +1,9 @@
-"""SIGKILL at random moments of a build of several files that do not fit in memory,
-otherwise like kills.py.
+"""Sends SIGKILL at random moments of a build of several files that do not fit in
+memory, otherwise like kills.py.
 
-The file is not there, as it was, or whole, and a build that goes on gives the bytes of
-one that ran through. The program tells itself that memory is small, and units with it:
-as a machine's would have to be for a city.
+Afterwards the file is missing, unchanged or complete, and a continued build gives the
+same bytes as one that was not interrupted. The program sets a small memory limit, and
+hence small units, so that small files are built like those of a city.
 """
 
 import sys

@@ -1,4 +1,5 @@
-"""Changes of files: of bytes, and of the content of a compressed stream or a zip."""
+"""Changes of files: of their bytes, and of the content of a compressed stream or a
+zip."""
 
 import gzip
 import re
@@ -76,7 +77,7 @@ def grown(data, rng, _):
 
 def flipped(data, rng, _):
     out = bytearray(data)
-    # Most decisions depend on the header.
+    # Most decisions of a reader depend on the header, so many changes are there.
     reach = rng.choice((len(out), min(len(out), 64), min(len(out), 512)))
     for _ in range(rng.choice((1, 1, 2, 8, 64)) if out else 0):
         out[rng.randrange(reach)] ^= 1 << rng.randrange(8)
@@ -142,7 +143,7 @@ def bytes_changed(data, rng, other):
 
 
 def words_changed(data, rng, _):
-    """Numbers and lines of a text are changed, for example of the header of a .ply
+    """Numbers and lines of a text are changed, such as those of the header of a .ply
     file."""
     lines = data.split(b"\n")
     end = next(
@@ -219,10 +220,10 @@ def zip_changed(data, rng, other):
 
 
 def tables_changed(data, rng):
-    """Sizes, CRCs, methods and places are changed in the headers of a zip's entries and
-    in its directory."""
+    """Sizes, CRCs, methods and offsets are changed in the headers of a zip's entries
+    and in its directory."""
     out = bytearray(data)
-    # A signature, and the places and sizes of the fields after it.
+    # A signature, and the offsets and sizes of the fields after it.
     fields = {
         b"PK\1\2": (
             (6, 2),

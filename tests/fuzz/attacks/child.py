@@ -1,5 +1,5 @@
-"""A child of pool.py: does the tries whose numbers come on stdin, and says on stdout
-what came of them.
+"""A child process of pool.py. It performs the tries whose numbers it reads from stdin,
+and reports their outcomes on stdout.
 
 child.py KIND SEED SHARED          prepares, and prints the seconds that a try may take
 child.py KIND SEED SHARED WORK     does tries
@@ -37,7 +37,7 @@ def main():
         work.mkdir()
         os.ftruncate(2, 0)
         os.lseek(2, 0, os.SEEK_SET)
-        attack.number = number  # for kinds that go through a list
+        attack.number = number  # for kinds that take their tries from a list
         what, do = attack.plan(random.Random(f"{kind} {seed} {number}"), work)
         print(json.dumps({"what": what}), file=answers, flush=True)
         faulthandler.dump_traceback_later(module.LIMIT_S, exit=True)

@@ -1,5 +1,5 @@
-"""Random command lines: each ends by itself with exit code 0, or with 1 or 2 and one
-line that gives the reason."""
+"""Runs random command lines. Each has to end by itself with exit code 0, or with 1 or 2
+and one line that states the reason."""
 
 import os
 import signal
@@ -9,7 +9,7 @@ import time
 from fuzz.attacks.program import copied, documents, fault_of, is_running, make_files, outcome, run
 
 LIMIT_S = 150
-LONG_S = 60  # all commands here are small
+LONG_S = 60  # in seconds; all commands here are small
 
 NUMBERS = (
     "0",
@@ -117,7 +117,7 @@ OUTPUTS += (
     "",
     "o" * 300 + ".ply",
 )
-# Options, and whether they take a number, a word, a path, or nothing.
+# The options, each with what it takes: a number, a word, a path, or nothing.
 VIEWS = {
     "--cameras": "p",
     "--distortion": "w",
@@ -331,8 +331,8 @@ def _change_outputs(rng, work, arguments):
 
 
 def _interrupt_server(process, out):
-    """Interrupt it when it has printed its address; if its stdout leads nowhere, after
-    the time that this takes."""
+    """Interrupt the server when it has printed its address. If its stdout is closed,
+    wait for the time that this takes."""
     end = time.monotonic() + 10
     while is_running(process) and time.monotonic() < end and b"http://" not in out.read_bytes():
         time.sleep(0.02)

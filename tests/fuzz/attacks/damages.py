@@ -1,5 +1,5 @@
-"""Damage that must be detected, and unusual files that must be read: as other programs
-write or break them."""
+"""Damage that must be detected, and unusual files that must be read because other
+programs write them."""
 
 import functools
 import io
@@ -185,7 +185,7 @@ def picture_of_another_sog(rng):
 
 
 def value_of_another_type(rng):
-    """Each field of a SOG's meta.json gets a value of another type in turn."""
+    """Each field of a SOG's meta.json in turn gets a value of another type."""
     files = dict(sog.encode(_asset()))
     meta = json.loads(files["meta.json"])
     holder, key = rng.choice(

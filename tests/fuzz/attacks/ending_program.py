@@ -1,9 +1,10 @@
-"""A program of ends.py: threads work, and it ends in some way while they do.
+"""A program that ends.py starts. Its threads are at work while it ends in one of
+several ways.
 
 ending_program.py WORK ENDING NUM_THREADS SECONDS GAP
 
-It says on stdout when it begins to end, in seconds of the monotonic clock. Work is done
-in the folder that it is started in, which has a.ply and a.v3dg.
+The program prints the time at which it begins to end, in seconds of the monotonic
+clock. It works in the current folder, which has a.ply and a.v3dg.
 """
 
 import atexit
@@ -142,7 +143,7 @@ def go_on(name, has_begun=None):
 
 
 def started(name, count):
-    """Return threads at work, each of which has finished something."""
+    """Return threads at work, once each of them has finished something."""
     has_begun = threading.Semaphore(0)
     for _ in range(count):
         threading.Thread(target=go_on, args=(name, has_begun), daemon=True).start()
@@ -165,7 +166,10 @@ def render_once():
 
 
 def end(how, work, gap):
-    """End in one of the ways. If this returns, the main module ends next."""
+    """End the program in one of the ways.
+
+    If this function returns, the main module ends next.
+    """
     if how == "handler renders":
         atexit.register(render_once)
     if how == "handler starts threads":

@@ -1,5 +1,5 @@
-"""Programs that end in every way while daemon threads are in all kinds of calls: with
-the right exit code, and soon."""
+"""Programs that end in various ways while daemon threads are in all kinds of calls.
+They have to end soon, with the right exit code."""
 
 import re
 import signal
@@ -16,7 +16,7 @@ from fuzz.attacks.program import copied, outcome, run
 from random_bundle import random_gaussians
 
 LIMIT_S = 120
-SOON_S = 15  # on a busy machine
+SOON_S = 15  # in seconds, on a busy machine
 PROGRAM = [sys.executable, str(Path(__file__).with_name("ending_program.py"))]
 # Exit codes by the way in which a program ends. An interrupt in an exit handler is
 # printed and ignored.

@@ -1,10 +1,10 @@
-"""Exports into strange folders: nothing of others is touched, and what was there is
-whole after a failure.
+"""Exports into unusual folders. Files of other programs must stay unchanged, and after
+a failure the previous content must be complete.
 
-A folder has files and folders of somebody, links, other names of files elsewhere,
-earlier exports, perhaps changed, records that claim what is not theirs, and perhaps the
-bundle that is exported. All that is below the work folder is compared before and after,
-by kinds, permissions, targets of links and hashes.
+A folder contains files and folders of a user, links, files with several names, earlier
+exports that may be changed, records that list files of others, and sometimes the bundle
+that is exported. Everything below the work folder is compared before and after, by
+kinds, permissions, targets of links and hashes.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ RECORD = "v3dg-export.json"
 
 WRITERS = {"sog": write_streamed_sog, "site": write_site, "tiles": write_tiles}
 ERRORS = (ValueError, OSError, RuntimeError)
-# Names that exports use, and others.
+# Names that exports use, and other names.
 OURS = (
     "index.html",
     "lod-meta.json",
@@ -89,7 +89,8 @@ def prepare(shared):
 
 
 def snapshot(folder):
-    """Return what each name below a folder is, without following links."""
+    """Return a description of each file below a folder, by its name, without following
+    links."""
     entries = {}
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -154,7 +155,10 @@ class Attack:
         return what, do
 
     def _subject(self, rng, work, folder):
-        """Return what is exported; it is in its own folder or in the output folder."""
+        """Return the subject of the export.
+
+        It is in a separate folder or in the output folder.
+        """
         (work / "cwd").mkdir()
         place = folder / rng.choice(("", "0_0", "data")) if rng.random() < 0.1 else work / "input"
         place.mkdir(parents=True, exist_ok=True)
@@ -163,8 +167,8 @@ class Attack:
         return place / rng.choice(("a.v3dg", "b.v3dg", "town.json"))
 
     def _fill(self, rng, work, folder):
-        """Put files into the folder; return those that exports wrote and nobody
-        changed, by name."""
+        """Put files into the folder. Return, by name, those that exports wrote and that
+        were not changed."""
         if rng.random() < 0.1 and not folder.exists():
             return {}
         recorded = {}
@@ -208,7 +212,7 @@ class Attack:
             os.symlink(rng.choice(targets), path)
 
     def _put_other_name(self, rng, work, folder):
-        """Add a hard link: to a file elsewhere, or elsewhere to a file here."""
+        """Add a hard link: here to a file elsewhere, or elsewhere to a file here."""
         with contextlib.suppress(OSError):
             path = folder / rng.choice(NAMES)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -261,8 +265,8 @@ class Attack:
         return {"data/towns.json", "data"} if act == 4 else set()
 
     def _put_hidden(self, rng, work, folder):
-        """Add what looks like the remains of a killed export, and refers to another
-        place."""
+        """Add files that look like the remains of an interrupted export and refer to
+        another folder."""
         hidden = folder / f".v3dg-export.{rng.randrange(1 << 64):016x}.tmp"
         act = rng.randrange(4)
         if act == 0:
@@ -292,7 +296,7 @@ class Attack:
         return (folder, Path("../project"), folder / "." / ".." / "project")[way - 1]
 
     def _reference(self, kind, subject, work):
-        """Return the files of an export into a new folder, by name."""
+        """Return, by name, the files that an export writes to a new folder."""
         key = kind, subject.name
         if key not in self._references:
             place = work.parent / f"{work.name}_{kind}_{subject.stem}"
@@ -349,7 +353,7 @@ def _export(way, kind, subject, output, overwrite, moment):
 
 @contextlib.contextmanager
 def _stopped(way, moment):
-    """Make a move fail, or interrupt it after it was done."""
+    """Make a rename fail, or interrupt the export after it."""
     rename, count = os.rename, 0
 
     def moved(*arguments, **options):
@@ -369,8 +373,8 @@ def _stopped(way, moment):
 
 
 def fault_of(before, after, recorded, written, error, overwrite):
-    """Return the fault in everything below the work folder after an export that may or
-    may not have ended."""
+    """Return the fault, if any, in everything below the work folder after an export
+    that may not have ended."""
     files = {name: entry for name, entry in written.items() if is_file(entry) and name != RECORD}
     missing = [
         name
@@ -389,8 +393,8 @@ def fault_of(before, after, recorded, written, error, overwrite):
 
 
 def fault_of_changes(before, after, recorded, written, overwrite):
-    """Return whether other files were changed, or new files are not those of the
-    export."""
+    """Return the fault if other files were changed, or if new files are not those of
+    the export."""
     for path in _differs(before, after):
         name = path.removeprefix("project/") if path.startswith("project/") else None
         old, new = before.get(path), after.get(path)

@@ -1,10 +1,11 @@
-"""Gaussians, cameras and poses of extreme numbers: zeros, denormal and huge ones,
-infinite ones and NaN.
+"""Gaussians, cameras and poses with extreme numbers: zero, denormal, huge, infinite,
+and NaN.
 
-Pictures are finite, whatever is drawn, and gradients are numbers where float32 can hold
-them. Pictures of sizes, distances and lengths of quaternions over many decades are the
-float64 reference's within the bounds of docs/numerics.md. Cuts are the same with every
-instruction set: a process for each of the others answers with digests.
+Pictures must be finite whatever is drawn, and gradients must be finite if float32 can
+represent them. For sizes, distances and lengths of quaternions over many decades,
+pictures must agree with the float64 reference within the bounds of docs/numerics.md.
+Cuts must be the same with every instruction set. For each other instruction set, a
+process returns digests.
 """
 
 import dataclasses
@@ -126,8 +127,8 @@ def gaussians_of(arrays):
 
 
 def extreme_fault(seed):
-    """Return what is not finite in a picture of gaussians with extreme values, or in
-    its gradients."""
+    """Return the fault if a picture of gaussians with extreme values, or its gradients,
+    are not finite."""
     rng = np.random.default_rng(seed)
     camera = camera_of(rng)
     arrays = usual_arrays(rng, 50, camera)
@@ -148,7 +149,9 @@ def extreme_fault(seed):
     if not ((image.alpha >= 0) & (image.alpha <= 1)).all():
         return "alpha: expected values from 0 to 1, got others"
     if "sh" in changed or "scales" in changed:
-        return None  # gradients are proportional to these, and may exceed float32
+        # gradients are proportional to these values, so they may exceed the range of
+        # float32
+        return None
     (image.color.sum() + image.alpha.sum()).backward()
     for name, tensor in tensors.items():
         if torch.isnan(tensor.grad).any():
@@ -157,8 +160,8 @@ def extreme_fault(seed):
 
 
 def reference_fault(seed):
-    """Return how a picture of gaussians over many decades differs from the float64
-    reference."""
+    """Return the fault if a picture of gaussians over many decades differs from the
+    float64 reference."""
     rng = np.random.default_rng(seed)
     camera = camera_of(rng)
     arrays = usual_arrays(rng, 30, camera)

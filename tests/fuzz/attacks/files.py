@@ -1,8 +1,9 @@
-"""Broken files for every reader: each is read, or refused in one line that names it, at
-a bounded cost.
+"""Broken files for every reader. Each has to be read, or refused with one line that
+names the file, at a bounded cost.
 
-Most tries change a good file: its bytes, what is packed in it, or the file itself while
-it is read. The others are made to cost much, or damaged in a way that must be noticed.
+Most tries change a valid file: its bytes, its compressed content, or the file itself
+while it is read. Other files are made to cost much, or are damaged in a way that must
+be detected.
 """
 
 import contextlib
@@ -26,15 +27,16 @@ from v3dg.camera_file import CameraWarning
 from v3dg.cleaning import AssetWarning
 from v3dg.cli import main
 
-LIMIT_S = 60  # longer is a hang
-# The bounds in docs/robustness.md on memory beyond what was used before: MB, bytes per
-# byte on disk, per gaussian and per byte of JSON, and per pixel of a compared picture.
+LIMIT_S = 60  # in seconds; a longer try counts as a hang
+# The bounds in docs/robustness.md on the additional memory of a reader: MB, bytes per
+# byte on disk, per gaussian and per byte of JSON, and bytes per pixel of a compared
+# picture.
 MOST_MB, A_BYTE, A_GAUSSIAN, A_BYTE_OF_JSON, A_PIXEL = 100, 8, 400, 40, 250
-# The number of gaussians in a file of any size. Larger files may have one for each of
-# their bytes.
+# The number of gaussians that a file of any size may have. Larger files may have one
+# per byte.
 BELIEVED = 1 << 18
-# Seconds on one core, which other work on the machine slows down, and seconds per
-# million bytes and per million gaussians.
+# Time limits on one core: seconds, and seconds per million bytes and per million
+# gaussians. Other work on the machine slows a try down.
 MOST_SECONDS, A_MILLION = 5, 3
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -53,7 +55,7 @@ def _put_ghostscript(folder):
 
 
 def compare_picture(path):
-    """Compare the picture with the one beside it."""
+    """Compare the picture with the one in the same folder."""
     said = io.StringIO()
     beside = path.with_name("b.png")
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
@@ -144,7 +146,7 @@ class Attack:
         own = changes.OWN.get(kind, changes.bytes_changed)
         change = own if rng.random() < 0.5 else rng.choice(changes.BYTES)
         files = good.files
-        if len(files) > 1 and rng.random() < 0.3:  # the files beside it
+        if len(files) > 1 and rng.random() < 0.3:  # the other files
             name = rng.choice(list(files)[1:])
             files = {**files, name: changes.bytes_changed(files[name], rng, other)}
             if rng.random() < 0.2:
@@ -156,7 +158,7 @@ class Attack:
             changes.truncated,
             changes.overwritten,
         )
-        if rng.random() < 0.03:  # with a name of another kind
+        if rng.random() < 0.03:  # gets the suffix of another kind
             name = rng.choice(
                 (
                     "a.ply",
@@ -220,7 +222,7 @@ class Attack:
         overwritten, replaced or removed."""
         good = self._good[kind][index]
         path = _put(work, good.files)
-        # The name may then be a pipe, and looking at its size would wait.
+        # The name may then be a pipe, and opening it to find its size would wait.
         read = compare_picture if kind == "picture" else _reader(kind)
         if (kind, index) not in self._num_calls:
             with _at_call(None, lambda: None) as calls:
@@ -254,7 +256,10 @@ class Attack:
 
 @contextlib.contextmanager
 def _at_call(number, action):
-    """Run an action at the call with this number, in Python or from Python."""
+    """Run an action at the call with this number.
+
+    Calls of Python functions, and calls from Python to C, are counted.
+    """
     calls = [0]
 
     def count(*_):
@@ -282,12 +287,14 @@ def _put(folder, files):
 
 
 def _tried(read, path):
-    """Return what was read or None, the text of the error, and what is wrong with
-    it."""
+    """Return the content or None, the text of the error, and the fault if there is
+    one."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", AssetWarning)  # notes about content that is not read
-        warnings.simplefilter("ignore", CameraWarning)  # and about images that are left out
+        # warnings about content that is not read
+        warnings.simplefilter("ignore", AssetWarning)
+        # and warnings about images that are left out
+        warnings.simplefilter("ignore", CameraWarning)
         try:
             return read(path), "", None
         except MemoryError as error:

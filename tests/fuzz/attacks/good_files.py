@@ -1,5 +1,5 @@
-"""One small valid file of each kind that is read, to be changed: its path, and the
-files beside it."""
+"""One small valid file of each kind that is read, which attacks change: its path, and
+the other files that belong to it."""
 
 import dataclasses
 import io
@@ -23,12 +23,12 @@ from v3dg.formats import sog
 
 @dataclasses.dataclass(frozen=True)
 class Good:
-    """Files by their paths; the first one is read."""
+    """Files by their paths. The reader is given the first one."""
 
     kind: str
     files: dict
-    # Formats that detect every change of their bytes: only the original content may be
-    # read.
+    # Whether the format detects every change of its bytes; then only the original
+    # content may be read.
     is_hashed: bool = False
 
     @property
@@ -156,7 +156,7 @@ def _checkpoints():
     colors["colors"] = tensors["sh0"][:, 0]
     settings = b"antialiased: true\nmodel_type: 2dgs\n"
     files = {"a.pt": checkpoint_bytes(colors), "cfg.yml": settings}
-    yield Good("checkpoint", files)  # the settings are not hashed
+    yield Good("checkpoint", files)  # the settings are not part of the hash
 
 
 def _bundles(folder):

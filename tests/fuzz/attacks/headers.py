@@ -1,9 +1,9 @@
-"""Requests to the viewer whose headers say odd things of where they come from.
+"""Requests to the viewer with wrong or unusual headers about where they come from.
 
-An answer is the page, a connection, or a refusal of a client's fault, never an error of
-the server's, and it tells browsers to show it to no other page. What is let in names
-this machine and no other page. Where a request is no HTTP at all, the connection is
-closed without an answer.
+A response has to be the web page, a connection, or a refusal that blames the client,
+but never a server error. It tells browsers not to show it to other sites. A request is
+only accepted if it names this machine and no other site. If a request is not HTTP, the
+connection is closed without a response.
 """
 
 import ipaddress
@@ -19,7 +19,7 @@ from v3dg.viewer.frame import SceneView
 from v3dg.viewer.server import Site
 
 LIMIT_S = 60
-_REQUESTS = 40  # of a try
+_REQUESTS = 40  # number of requests in a try
 _SECONDS = 20
 _ANSWERS = (101, 200, 400, 403, 404, 426)
 _LET_IN = (101, 200, 404)
@@ -168,8 +168,8 @@ class Attack:
 
 
 def _request(rng, port):
-    """Return a path and headers as a browser sends them, with some exchanged, damaged,
-    missing or repeated."""
+    """Return a path and headers like those that a browser sends, with some of them
+    exchanged, damaged, missing or repeated."""
     host = rng.choice(_HOSTS if rng.random() < 0.7 else _OTHER_HOSTS).format(port=port)
     headers = [("Host", host)]
     if rng.random() < 0.5:
@@ -211,7 +211,7 @@ def _damaged(rng, value):
 
 
 def _fault_of(answer, path, headers):
-    """Return what is wrong with an answer, or None."""
+    """Return the fault of a response, or None."""
     if not answer:
         return None
     head = answer.partition(b"\r\n\r\n")[0].lower()

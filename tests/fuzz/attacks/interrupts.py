@@ -1,8 +1,8 @@
-"""Ctrl-C at a random moment of every command, once or twice, to one process or to all
-of the terminal's.
+"""Sends Ctrl-C at a random moment of every command, once or twice, to one process or to
+all processes of the terminal.
 
-The command ends soon, with one line and 130 unless it had finished, leaves no process
-behind, and of each file that it writes all or nothing.
+The command has to end soon, with one line and exit code 130 unless it had finished. It
+must leave no process behind, and write each of its files completely or not at all.
 """
 
 import contextlib
@@ -34,11 +34,11 @@ from random_bundle import random_gaussians
 
 LIMIT_S = 100
 PACKAGE = os.path.dirname(v3dg.__file__) + os.sep
-# Before Ctrl-C has an effect, only the start of Python and the import of one small
-# module of ours run.
+# Before Ctrl-C is handled, only Python's start and the import of one small module of
+# ours run.
 NOTE = re.compile(r"\S+\.\w+: ")  # a command reports this about a file
 OURS = re.compile(re.escape(PACKAGE) + r"(?!__init__\.py\", line 3, |_start\.py)")
-SOON_S = 15  # on a busy machine
+SOON_S = 15  # in seconds, on a busy machine
 
 SMALL = ["--size", "40", "30", "--quiet"]
 COMMANDS = {
@@ -127,8 +127,8 @@ class Attack:
         return name, do
 
     def _of_nothing(self, name, work):
-        """Return the seconds of a command that nothing interrupts, and the files that
-        it writes."""
+        """Return the duration of an uninterrupted command in seconds, and the files
+        that it writes."""
         place = work.parent / f"{work.name}_whole"
         place.mkdir()
         before = names_in(copied(self._shared, place))
@@ -145,7 +145,7 @@ class Attack:
                 continue
             if path not in made:
                 return f"left {path}"
-            if name == "demo":  # shows how long things took
+            if name == "demo":  # the output contains durations
                 with Image.open(work / path) as picture:
                     picture.load()
             elif (work / path).read_bytes() != made[path]:
@@ -157,8 +157,8 @@ class Attack:
 
 
 def _wait_for(process, out, moment, name, connections):
-    """Wait for the moment; for the viewer, this is often after it has begun to listen,
-    with other connections."""
+    """Wait for the moment. For the viewer, the moment is often after it has begun to
+    listen, and other connections exist then."""
     end = time.monotonic() + moment
     if name == "view, connected":
         port, patience = None, time.monotonic() + 20
@@ -187,14 +187,15 @@ def _fault(ended: Ended, name):
     if ended.was_long:
         return "did not end by itself" + (f", and left behind: {ended.left}" if ended.left else "")
     if ended.code == -signal.SIGINT and not ended.err:
-        return f"left behind: {ended.left}" if ended.left else None  # before Python handled it
+        # the signal came before Python handled it
+        return f"left behind: {ended.left}" if ended.left else None
     if "KeyboardInterrupt" in ended.err and ERROR not in ended.err and not OURS.search(ended.err):
-        # None of our code ran before this.
+        # The signal came before any of our code ran.
         return f"left behind: {ended.left}" if ended.left else None
     is_view = name.startswith("view")
     fault = fault_of(ended, codes=(0, 130), is_heard=not is_view)
     lines = [line for line in shown_lines(ended.err) if not PROGRESS.match(line)]
-    if ended.code == 0:  # a command that ends reports what it noticed about its files
+    if ended.code == 0:  # a command that ends also prints warnings about its files
         lines = [line for line in lines if not NOTE.match(line)]
     if fault is None and len(lines) > (ended.code != 0):
         fault = f"{len(lines)} lines: {ended.err[-200:]!a}"

@@ -1,8 +1,8 @@
-"""SIGKILL at a random moment of a build, a save and a conversion: the file is not
-there, as it was, or whole.
+"""Sends SIGKILL at a random moment of a build, a save or a conversion. Afterwards the
+file has to be missing, unchanged or complete.
 
-A build that is resumed afterwards, perhaps of another asset by then, gives the bytes of
-one that ran through.
+A build that is then resumed, sometimes with another asset, has to give the same bytes
+as one that was not interrupted.
 """
 
 import os
@@ -101,7 +101,7 @@ class Attack:
                 swaps
                 and ended.code == 1
                 and f"{name}.partial: expected levels of this build" in ended.err
-            ):  # as expected
+            ):  # the file is missing, as expected
                 (work / f"{name}.partial").unlink()
                 ended = run([], work, program=program, limit_s=60)
             fault = fault_of(ended, codes=(0,))
@@ -124,7 +124,7 @@ class Attack:
         return names_in(work)
 
     def _of_nothing(self, what, asset, work):
-        """Return the seconds and the bytes of a run that nothing stops."""
+        """Return the seconds and the bytes of an uninterrupted run."""
         key = what, asset if what.startswith("build") else ""
         if key not in self._whole:
             program, name = self.kinds[what]
@@ -137,7 +137,7 @@ class Attack:
 
 
 def _left(work, name):
-    """Return what an unfinished build left."""
+    """Return the file that an unfinished build left."""
     return " and ".join(end for end in ("partial", "scratch") if (work / f"{name}.{end}").exists())
 
 
@@ -149,10 +149,11 @@ def _kill(moment, process, _):
 
 
 def _fault_of_files(work, before, name, whole, is_replaced):
-    """Return whether the file is unchanged or whole, and beside it are only files that
+    """Return the fault unless the file is unchanged or complete, and the other files
     are known to be unfinished."""
     for path in names_in(work) - before - {name, f"{name}.partial"}:
-        if path.startswith(f"{name}.scratch"):  # removed by the next one that ends
+        # the next build that ends removes this file
+        if path.startswith(f"{name}.scratch"):
             continue
         if not (path.startswith(f".{name}") and path.endswith(".tmp")):
             return f"left {path}"

@@ -1,5 +1,5 @@
-"""Commands with a random limit on memory, which is set after their modules are loaded:
-they succeed, or print one line."""
+"""Runs commands with a random memory limit, which is set after their modules are
+loaded. They have to succeed or print one line."""
 
 import resource
 import sys
@@ -10,11 +10,11 @@ from fuzz.attacks.program import copied, fault_of, make_files, outcome, run
 
 LIMIT_S = 120
 # Before the limit is set, modules are loaded, the threads of OpenMP are started, and
-# the stack has grown, because failures of these end a process without a message. So
-# does NumPy if there is no memory for the buffers of an operation, 64 kB each
-# (PyErr_NoMemory of npyiter_allocate_buffers, without the GIL, 2.4), so they are made
-# small. Pillow would not report why it does not know a format whose module could not be
-# loaded.
+# the stack has grown, because failures of these would end the process without a
+# message. NumPy also ends the process if there is no memory for the 64 kB buffers of an
+# operation (PyErr_NoMemory in npyiter_allocate_buffers, without the GIL, in version
+# 2.4), so these buffers are made small. Pillow does not report which module of a format
+# could not be loaded.
 PROGRAM = """
 import contextlib, importlib, json, pkgutil, resource, sys
 import numpy, PIL.Image, zstandard
@@ -64,7 +64,7 @@ class Attack:
             ended = run(
                 COMMANDS[name], work, program=program, limit_s=90, most=resource.RLIM_INFINITY
             )
-            # This is the C library, after whose failure no program can continue.
+            # This message comes from the C library. No program can continue after it.
             if "memory for thread-local data" in ended.err:
                 return Outcome("ended by the C library")
             fault = fault_of(ended, codes=(0, 1))

@@ -1,15 +1,16 @@
-"""The peak memory of a piece of work, and a limit so that no try takes all memory of
-the machine."""
+"""Measures the peak memory of a piece of work, and limits it so that no try takes all
+memory of the machine."""
 
 import ctypes
 import resource
 
 
 class Watch:
-    """Measures from its creation on."""
+    """Measures memory from the creation of this object on."""
 
     def __init__(self):
-        ctypes.CDLL(None).malloc_trim(0)  # freed memory would hide what is allocated next
+        # otherwise memory that was freed before would hide later allocations
+        ctypes.CDLL(None).malloc_trim(0)
         with open("/proc/self/clear_refs", "w") as file:
             file.write("5")
         self._before = _status("VmRSS")

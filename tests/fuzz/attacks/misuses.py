@@ -1,9 +1,9 @@
-"""The public functions with wrong, odd or extreme arguments, and writes to arrays that
-are handed out.
+"""Calls the public functions with wrong, unusual or extreme arguments, and writes to
+arrays that they return.
 
-A call gives a result, or a ValueError, TypeError, RuntimeError or OSError, in one line
-that names the fault. Where that is Python's own word on a value of another kind, it is
-low.
+A call has to return a result, or raise a ValueError, TypeError, RuntimeError or OSError
+with one line that names the faulty argument. If the message is Python's own about a
+value of another type, the finding is only "low".
 """
 
 import inspect
@@ -158,8 +158,8 @@ class Attack:
         return name, do
 
     def _writing(self, rng):
-        """An array that is handed out is read-only, or writing to it has no effect on
-        us."""
+        """Returned arrays are read-only, or writing to them has no effect on the
+        package."""
         bundle = v3dg.Bundle.open(self._shared / "a.v3dg")
         camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
         scene = v3dg.Scene.of(bundle)
@@ -236,7 +236,7 @@ def _calls(shared, work):
 
     def built(**values):
         config = v3dg.BuildConfig(**values)
-        if config.steps < 10:  # more is much work, and not a mistake
+        if config.steps < 10:  # more steps would only take time
             v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
 
     def rendered_from(**values):
@@ -650,7 +650,7 @@ def _text(value):
 
 
 def _outcome_of_call(function, arguments, wrong, told):
-    """Return the outcome of a call; `told` describes its arguments."""
+    """Return the outcome of a call. `told` is the description of its arguments."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
@@ -658,7 +658,7 @@ def _outcome_of_call(function, arguments, wrong, told):
         except Exception as error:
             name, text = type(error).__name__, str(error)
             fault = f"{name}: {text[:150]!a}, {told}"[:500]
-            # Arguments may have several lines in a message, as arrays have.
+            # Arguments that are arrays may take several lines of a message.
             is_one_line = "\n" not in text.replace("a\nb", "") or ": expected " in text
             is_ours = name in ERRORS and not NOT_OURS.search(text) and is_one_line
             if not is_ours and name not in PYTHONS:
@@ -673,8 +673,8 @@ def _outcome_of_call(function, arguments, wrong, told):
 
 
 def _names(text, wrong):
-    """Return whether a text says which argument it is about: by its name, or in the
-    form of our messages."""
+    """Return whether a text identifies the argument, by its name or in the form of our
+    messages."""
     return bool(re.match(r"[\w.\[\], ()'/-]+: ", text)) or any(
         re.sub(r".*\.", "", name) in text for name in wrong
     )

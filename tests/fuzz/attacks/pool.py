@@ -1,11 +1,11 @@
-"""Tries of one kind in child processes: a crash, a hang or a fault is one try's, and
-the others go on.
+"""Runs the tries of one kind in child processes, so that a crash, a hang or a fault
+affects only one try.
 
-A kind is a module with LIMIT_S, the seconds that a try may take, `prepare(shared)`,
-which puts into a folder what all children read, and a class `Attack(shared)`. Its
-`plan(rng, work)` prepares a try in the empty folder `work` and returns what it is in a
-few words, by which findings are counted together, and a function that does it and
-returns an `Outcome`.
+A kind is a module. It has LIMIT_S, the maximum seconds of a try, `prepare(shared)`,
+which writes data for all children to a folder, and a class `Attack(shared)`. The method
+`plan(rng, work)` prepares a try in the empty folder `work`. It returns a short
+description, by which findings are counted together, and a function that performs the
+try and returns an `Outcome`.
 """
 
 import collections
@@ -28,22 +28,22 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 TESTS = HERE.parents[1]
 KEPT_OF_ONE_SORT = 3
-QUOTE = ": '"  # the rest distinguishes faults of the same kind
+QUOTE = ": '"  # the text after this distinguishes faults of the same kind
 
 
 @dataclasses.dataclass
 class Outcome:
-    """The outcome of a try."""
+    """The result of a try."""
 
     name: str
-    fault: str | None = None  # one line; None if everything was right
-    is_low: bool = False  # only a message that could say more
+    fault: str | None = None  # one line about the fault; None if there was none
+    is_low: bool = False  # whether the fault is only a message that could say more
     megabytes: float = 0.0  # peak memory; the child measures it if it does the work itself
 
 
 def environment():
-    """Return the environment of a child: v3dg, the tests, and no more threads than
-    children."""
+    """Return the environment of a child, which finds v3dg and the tests, and has no
+    more threads than there are children."""
     given = [
         os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path
     ]
@@ -62,7 +62,7 @@ def has_module():
 
 
 class Child:
-    """A process that does tries. If a try ends it, it is started again."""
+    """A process that performs tries. If a try ends it, it is started again."""
 
     def __init__(self, kind, seed, shared, work, limit_s):
         self._command = [
@@ -127,7 +127,7 @@ class Child:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=environment(),
-                cwd=self._log.parent,  # for files that are written under a plain name
+                cwd=self._log.parent,  # files with relative names are written here
                 start_new_session=True,
                 bufsize=0,  # `select` does not see data in a buffer
             )
@@ -156,15 +156,15 @@ class Child:
 
 
 def _quick_folder():
-    """Return a folder in memory if there is enough, because each try writes files, and
-    a disk would delay it."""
+    """Return a folder in memory if there is enough of it. Each try writes files, and a
+    disk would slow it down."""
     shared = "/dev/shm"
     return shared if os.path.isdir(shared) and shutil.disk_usage(shared).free > 2 << 30 else None
 
 
 def _stack_of(log):
-    """Return the stack of the thread that did it; if this is unknown, of the main
-    thread, which is the last."""
+    """Return the stack of the thread that caused the crash. If that thread is unknown,
+    return the main thread's stack, which comes last."""
     log = (
         log.rsplit("Current thread ", 1)[-1]
         if "Current thread " in log

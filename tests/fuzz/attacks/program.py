@@ -1,5 +1,5 @@
-"""The command line as users start it: its inputs, how it ends, what it leaves behind,
-and what is wrong."""
+"""Starts the command line as users do, and checks how it ends and what it leaves
+behind."""
 
 import contextlib
 import dataclasses
@@ -21,10 +21,11 @@ from fuzz.attacks.pool import Outcome
 from random_bundle import random_gaussians
 
 COMMAND = [sys.executable, "-m", "v3dg"]
-MOST_BYTES = 8 << 30  # address space; more would endanger the machine, not the program
-# Lines that are no errors: of OpenMP's runtime about its settings, names of assets that
-# a command reads, progress bars, and that there was no memory for the thread that
-# watches the progress.
+# limit of the address space, so that a program cannot take all memory of the machine
+MOST_BYTES = 8 << 30
+# Lines of output that are not errors: those of OpenMP's runtime about its settings,
+# names of assets that a command reads, progress bars, and the line that there was no
+# memory for the thread that shows the progress.
 PROGRESS = re.compile(r"libgomp: |v3dg: warning: tqdm:|\[\d+/\d+\] |failed: |.*: \d+ %$|$")
 ERROR = "v3dg: error: "
 
@@ -62,7 +63,7 @@ def make_files(folder):
 class Ended:
     """How a program ended."""
 
-    code: int | None  # None: it did not end, and was killed
+    code: int | None  # None if it did not end and was killed
     out: str
     err: str
     seconds: float
@@ -86,14 +87,15 @@ def run(
     """Start a program in its own session, let `meddle` do something to it, and return
     how it ends.
 
-    What takes longer than the limit is interrupted as by Ctrl-C, and killed when that
-    does not help.
+    If the program exceeds the time limit, it is interrupted as by Ctrl-C, and killed if
+    that does not help.
     """
     logs = [folder.parent / f"{folder.name}.{end}" for end in ("out", "err")]
     files = [log.open("wb") for log in logs]
 
     def before():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # background jobs of a shell ignore it
+        # background jobs of a shell ignore SIGINT
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         for descriptor in closed:
             os.close(descriptor)
@@ -142,14 +144,14 @@ def _wait(process, end):
 
 
 def is_running(process):
-    """Return whether it runs, without reaping it, because another place waits for its
-    exit code."""
+    """Return whether a process is running, without reaping it, because its exit code is
+    read elsewhere."""
     return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
 
 def _in_session(leader, patience_s=2):
-    """Return the processes of a session whose first process has ended, after a moment
-    in which they could end, too."""
+    """Return the processes that remain in a session a moment after its first process
+    has ended."""
     end = time.monotonic() + patience_s
     while True:
         found = {}
@@ -165,13 +167,14 @@ def _in_session(leader, patience_s=2):
 
 
 def shown_lines(text):
-    """Return the lines that a terminal shows at last, if lines were overwritten."""
+    """Return the lines that a terminal finally shows, where later lines overwrite
+    earlier ones."""
     lines = [line.rstrip().rsplit("\r", 1)[-1] for line in text.split("\n")]
     return [line for line in lines if line.strip()]
 
 
 def fault_of(ended, *, codes=(0, 1, 2), is_heard=True):
-    """Return what is wrong with the way in which a command ended."""
+    """Return the fault in the way in which a command ended, or None."""
     if ended.code is None:
         return f"no end, and Ctrl-C did not help: {ended.err[-200:]!a}"
     if ended.code < 0:

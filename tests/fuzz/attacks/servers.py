@@ -1,11 +1,10 @@
-"""Web servers that lie, go on without end, stop, or send elsewhere, and commands that
-read files from them.
+"""Web servers that send wrong data, do not stop sending, stop too early, or redirect,
+and commands that read files from them.
 
-Whatever a server does, a command ends soon, with a right result or one line that says
-what is wrong. It takes no more from the server than was asked for, holds little memory,
-leaves nothing in the folder for temporary files, and prints no password and no
-signature. The number of a try chooses the server: those of `BEHAVIOURS` one after
-another.
+Whatever a server does, a command has to end soon, with a correct result or one line
+that says what is wrong. It must not read more from the server than it requested, use
+little memory, leave nothing in the folder for temporary files, and print no password
+and no signature. The number of a try selects the server from `BEHAVIOURS`, in order.
 """
 
 import contextlib
@@ -30,13 +29,15 @@ from v3dg.bundle.codec import Codec
 
 LIMIT_S = 100
 SOON_S = 60
-PATIENCE_S = 3  # shorter than in the program, so that a round takes minutes
-MOST_UNKNOWN_BYTES = 16 << 20  # likewise
-MOST_SENT = 12 << 20  # beyond the file: data in buffers of sockets, of several requests
+PATIENCE_S = 3  # in seconds; shorter than in the package, so that a round takes minutes
+MOST_UNKNOWN_BYTES = 16 << 20  # smaller than in the package
+# bytes that may be sent in addition to the file: data in buffers of sockets, for
+# several requests
+MOST_SENT = 12 << 20
 MOST_MEGABYTES = 500
 MOST_ADDRESSES = 6 << 30
-# If data arrives without end instead of the rest of a file, only the patience ends it;
-# the data is not kept.
+# If endless data arrives instead of the rest of a file, only the timeout ends it. The
+# data is not stored.
 OUTSIDE_OF_BODIES = ("100 without end", "chunk's extension without end", "trailers without end")
 SECRETS = ("hunter2", "s1gnature", "Zm9v")
 TB = 1 << 40
@@ -52,7 +53,7 @@ sys.exit(main())
 
 
 class Connection:
-    """One connection of a client, and its requests."""
+    """A connection of a client, and the requests on it."""
 
     def __init__(self, server, stream):
         self.server = server
@@ -94,7 +95,7 @@ class Connection:
             self.send(body)
 
     def good(self, **headers):
-        """Answer like a correct server."""
+        """Respond like a correct server."""
         body = self.server.body
         if self.part and self.part[0] < len(body):
             first, last = self.part[0], min(self.part[1], len(body))
@@ -151,7 +152,8 @@ class Server:
         self._socket.close()
 
 
-# ---- What servers do. Of those for a HEAD that is honest, `at_get` is the rest.
+# ---- Behaviours of servers. `at_get` responds to HEAD correctly, and behaves otherwise
+# in all other requests.
 def at_get(behaviour):
     return lambda c: c.good() if c.method == "HEAD" else behaviour(c)
 
@@ -276,7 +278,7 @@ def chunked(*chunks, end=b"0\r\n\r\n", endless=None):
 
 
 def of_unknown_size(body=None, endless=False):
-    """The server knows no HEAD request, no ranges and no size."""
+    """The server supports neither HEAD requests nor ranges, and sends no size."""
 
     def behaviour(c):
         if c.method == "HEAD":
@@ -365,8 +367,8 @@ def tagged(c):
 ENDLESS_HEADER = b"HTTP/1.1 200 OK\r\n"
 RIGHT, WRONG, EITHER = "right", "wrong", "either"
 
-# The behaviours of a server: the kind of file that is requested, the expected end, and
-# the function.
+# The behaviours of servers. Each has the kind of file that is requested, the expected
+# end, and the function.
 BEHAVIOURS = {
     "honest": ("v3dg", RIGHT, lambda c: c.good()),
     "honest asset": ("ply", RIGHT, lambda c: c.good()),

@@ -1,11 +1,11 @@
-"""Views that settle in pools, on a loaded machine: the next picture misses nothing and
-has the right bits.
+"""Views settle in pools while the machine is busy. The next picture must miss no page
+and have the right bits.
 
-Pictures are compared bit for bit with those of the same scene all of which is resident,
-at the tolerance that they say they were drawn with. Between settled pictures are others
-that wait for nothing, so that earlier views are decided about, pages arrive and leave,
-and tolerances adapt while a view settles. The environment variable V3DG_ATTACK_DEVICE
-names another device than the CPU.
+Pictures are compared bit for bit with those of the same scene with all pages resident,
+drawn at the tolerance that the picture reports. Between settled pictures, other
+pictures are drawn without waiting, so that pages for earlier views arrive and leave,
+and tolerances adapt, while a view settles. The environment variable V3DG_ATTACK_DEVICE
+selects a device other than the CPU.
 """
 
 import contextlib
@@ -74,7 +74,7 @@ class Attack:
 
 
 class Expected:
-    """Digests of pictures of scenes that are resident as a whole."""
+    """The digests of pictures of scenes that are completely resident."""
 
     def __init__(self):
         self._renderers = {}
@@ -113,7 +113,7 @@ class Trial:
         )
 
     def fault_of(self, number, image):
-        """Return what is wrong with the picture of a settled view, or None."""
+        """Return the fault of the picture of a settled view, or None."""
         stats = image.stats
         if stats.missing:
             return f"a settled picture misses {stats.missing} pages"
@@ -160,8 +160,8 @@ def busy_threads(count):
 
 
 def after_settling(trial):
-    """Draw right after each `settle`, in a flight with pictures in between that do not
-    wait."""
+    """Draw immediately after each `settle` of a flight. Other pictures are drawn in
+    between without waiting."""
     renderer = v3dg.Renderer(trial.scene, device=DEVICE, memory=trial.memory)
     for _ in range(NUM_SETTLED):
         for number in trial.rng.integers(0, NUM_CAMERAS, int(trial.rng.integers(0, 3))):
@@ -198,8 +198,8 @@ def stills_of_threads(trial):
 
 
 def forks(trial):
-    """Fork a process whose threads draw. Its children draw what they may share
-    correctly, and get a clear error for the rest."""
+    """Fork a process whose threads draw. Its children must draw correctly if they may
+    use an object, and otherwise get a clear error."""
     faults = []
     ends = threading.Event()
     renderer = v3dg.Renderer(trial.scene, device=DEVICE, memory=trial.memory)
@@ -232,7 +232,7 @@ def forks(trial):
 
 
 def in_child(trial, renderer, number):
-    """Return what a child of a fork finds, or None."""
+    """Return the fault that a forked child finds, or None."""
     camera = trial.camera(number)
     image = v3dg.render(trial.scene, camera, device=DEVICE, memory=trial.memory, **trial.cut)
     if fault := trial.fault_of(number, image):
@@ -252,8 +252,8 @@ def in_child(trial, renderer, number):
 
 
 def fault_of_child(work):
-    """Return what work() returns in a child of a fork; a child that does not end is a
-    fault."""
+    """Return the result of work() in a forked child. It is a fault if the child does
+    not end."""
     with tempfile.TemporaryFile() as report:
         pid = os.fork()
         if pid == 0:
@@ -296,5 +296,5 @@ def in_threads(works, faults):
 
 
 STORIES = [after_settling, after_settling, after_settling, stills_of_threads, stills_of_threads]
-if DEVICE == "cpu":  # CUDA does not work in children of a fork.
+if DEVICE == "cpu":  # CUDA cannot be used in forked children.
     STORIES.append(forks)

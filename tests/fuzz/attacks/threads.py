@@ -1,7 +1,7 @@
-"""Threads that change a scene while others draw, select and copy it: all see it as it
-was or as it is.
+"""Threads change a scene while others draw, select and copy it. Each of these must see
+the scene either before or after a change.
 
-Pictures are compared bit for bit with those of scenes that stand still.
+Pictures are compared bit for bit with those of scenes that do not change.
 """
 
 import copy
@@ -74,8 +74,8 @@ def _scene(bundles, poses):
 
 
 def _together(change, looks, num_changes):
-    """Return the first fault of the threads that look, while the main thread changes
-    the scene."""
+    """Return the first fault that a thread observes while the main thread changes the
+    scene."""
     ends, faults = threading.Event(), []
 
     def go_on(look, right):
@@ -100,7 +100,7 @@ def _together(change, looks, num_changes):
 
 
 def _looks(scene, states):
-    """Run threads that draw, select and use a copy."""
+    """Run threads that draw, select, and use a copy."""
     pictures, cuts = _of_states(_drawn, states), _of_states(_selected, states)
     return [
         *[(lambda: _drawn(scene), pictures)] * NUM_DRAWERS,
@@ -181,7 +181,10 @@ def added_by_many(rng, bundles):
 
 
 def moved_by_many(rng, bundles):
-    """Each thread moves its own instances; at the end all are where they were put."""
+    """Each thread moves its own instances.
+
+    At the end, all instances are where they were moved to.
+    """
     poses, last = _poses(rng, 20), _poses(rng, 20)
     scene, expected = _scene(bundles, poses), _scene(bundles, last)
 

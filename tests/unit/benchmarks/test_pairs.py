@@ -1,4 +1,4 @@
-"""The study of levels at equal counts and sizes, on small assets."""
+"""Tests the study of levels at equal counts and sizes, with small assets."""
 
 import json
 import math
@@ -76,8 +76,8 @@ def test_level_is_at_home_at_two_px2_of_the_ball_a_gaussian(folder):
     thing = subject(folder, "thing")
     for factor in (1, 4):
         for size in thing.sizes(300, factor, widest=1 << 20):
-            # The ball touches the borders of the picture, so its footprint is the
-            # inscribed disc, enlarged by the nearness.
+            # The ball touches the borders of the picture. Its footprint is therefore
+            # the inscribed disc, enlarged because the ball is near.
             half = size.camera.width / 2
             angle = math.atan(half / size.camera.fx)
             footprint = 2 * math.pi * (1 - math.cos(angle)) * size.camera.fx**2
@@ -167,8 +167,8 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
             assert rows["place", "d", "12.5 %, d", factor]["gaussians"] == in_picture
             assert rows["place", "ours", "12.5 %, d", factor]["gaussians"] <= in_picture
     best = [row for row in best if row["asset"] == "thing"]
-    # The second run measures one method again and one new method; the other results are
-    # those of the first run.
+    # The second run measures one method again, and one new method. All other results
+    # are those of the first run.
     known = (tmp_path / "all" / "pairs.json",)
     methods = ("refined", "merged")
     again = pairs.Measure(

@@ -4,8 +4,8 @@ import pytest
 from benchmarks.worlds.paper_cameras import trajectories
 from v3dg import Camera
 
-# Two cameras of the published DonutSea as camera-to-world matrices in Blender's
-# convention, with all published digits.
+# Two cameras of the published DonutSea, as camera-to-world matrices in Blender's
+# convention with all published digits.
 PUBLISHED = {
     "000_camera_0": [
         [-1, 0, 0, 0],

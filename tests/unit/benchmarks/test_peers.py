@@ -1,4 +1,7 @@
-"""The comparison with other rasterizers on the CPU, with replacements for them."""
+"""Tests the comparison with other rasterizers on the CPU.
+
+Scripts replace the other rasterizers.
+"""
 
 import json
 from dataclasses import fields
@@ -16,7 +19,7 @@ from reference import project
 
 torch = pytest.importorskip("torch")
 
-# Draws with our own rasterizer under the options of gsplat.
+# This script draws with our own rasterizer, but takes the options of gsplat.
 GSPLAT = """
 import torch, v3dg
 
@@ -28,7 +31,7 @@ def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, 
     image = v3dg.rasterize(gaussians, camera, filter_px2=eps2d)
     return image.color[None], image.alpha[None, ..., None], {}
 """
-# Draws a picture that is wrong by a tenth everywhere.
+# This script draws a picture that is wrong by a tenth everywhere.
 FASTER_GS = """
 from collections import namedtuple
 import torch
@@ -70,8 +73,8 @@ LAYOUT = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """One object and two copies of it, and three peers: one draws correctly, one draws
-    wrongly, and one crashes."""
+    """An object and two copies of it. There are three rasterizers: one draws correctly,
+    one draws wrongly, and one crashes."""
     folder = tmp_path_factory.mktemp("peers")
     files = {
         "layout.json": json.dumps(LAYOUT),
@@ -240,4 +243,5 @@ def test_captured_assets_are_seen_from_above(folder):
         px = view[:, :2] / view[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         inside = ((px > 0) & (px < [camera.width, camera.height])).all(1) & (view[:, 2] > 0)
         assert inside.mean() > 0.85
-        assert (camera.viewmat[2, 2] < -0.9) == steep  # looks down along z of the world
+        # looks down along the world's z axis
+        assert (camera.viewmat[2, 2] < -0.9) == steep

@@ -145,8 +145,8 @@ def test_person_has_human_measures(seed):
 
 @pytest.mark.parametrize("make", [make_donut, make_temple, make_person])
 def test_surfaces_are_spread_like_trained_ones(make):
-    """The values agree with those of a trained asset within factors; docs/worlds.md has
-    both."""
+    """The values of generated surfaces and of a trained asset differ by limited
+    factors. docs/worlds.md has both."""
     asset = make(60_000)
     thin, middle, long = np.sort(asset.scales, axis=1).T
     assert 2 < np.median(long / middle) < 4.5
@@ -161,8 +161,8 @@ def test_leaves_are_thin_and_let_light_through():
     thin, _, long = np.sort(tree.scales, axis=1).T
     assert np.median(long / thin) > 8
     assert (tree.opacities < 0.75).mean() > 0.2
-    # A leaf is brighter against the sun than along it, because the linear terms of
-    # green follow the direction of the sun.
+    # A leaf is brighter when it is seen against the sun than along it, because the
+    # linear terms of green follow the direction of the sun.
     from benchmarks.worlds.procedural._light import TO_SUN
 
     linear = tree.sh[:, 1:4, 1] @ np.array([TO_SUN[1], -TO_SUN[2], TO_SUN[0]])

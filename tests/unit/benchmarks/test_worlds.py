@@ -205,7 +205,8 @@ def test_an_interrupted_world_goes_on(tmp_path, monkeypatch):
     assert sorted(p.name for p in path.parent.iterdir()) == names
     for name in names:
         assert (whole / name).read_bytes() == (path.parent / name).read_bytes()
-    # Without the record, or with other settings, everything is built again.
+    # Without the record of the build, or with other settings, everything is built
+    # again.
     worlds.write_world(world, tmp_path / "cut", **options)
     again = (path.parent / "person_00.v3dg").stat().st_mtime_ns
     assert again > first

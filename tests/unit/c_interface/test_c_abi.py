@@ -1,8 +1,8 @@
 """Compares the binary interface of the C library with the committed one: its symbols,
 structs and constants.
 
-After an intended change, raise V3DG_ABI_VERSION (unless functions were only added), and
-write the new list: run this file with `PYTHONPATH=tests/support python`.
+After an intended change, raise V3DG_ABI_VERSION, unless functions were only added. Then
+write the new list by running this file with `PYTHONPATH=tests/support python`.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ import c_library
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
 HEADER = ROOT / "include" / "v3dg.h"
-pytestmark = pytest.mark.slow  # the library is compiled first
+pytestmark = pytest.mark.slow  # slow, because the library is compiled first
 
 
 def compiler():

@@ -1,4 +1,4 @@
-"""Wrong arguments of the C library are errors that name them."""
+"""Wrong arguments of the C library raise errors that name them."""
 
 import contextlib
 import ctypes
@@ -13,7 +13,7 @@ from c_library import Camera, CScene, Failure, Instance, Rule, c_camera, c_rule,
 from random_bundle import random_bundle
 from v3dg import Camera as PythonCamera
 
-pytestmark = pytest.mark.slow  # the library is compiled first
+pytestmark = pytest.mark.slow  # slow, because the library is compiled first
 CAMERA = PythonCamera.look_at((0, -3, 0), (0, 0, 0), width=64, height=48)
 
 
@@ -27,7 +27,7 @@ def scene(tmp_path_factory):
 
 @contextlib.contextmanager
 def refused(expected):
-    """Expect an argument error with a message that begins with a text."""
+    """Expect an argument error whose message begins with a text."""
     with pytest.raises(Failure, match=expected) as failure:
         yield
     assert failure.value.status == c_library.ARGUMENT

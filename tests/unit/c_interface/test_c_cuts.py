@@ -13,7 +13,7 @@ from random_bundle import random_bundle
 from scenes_lod import blob, lod_bundle, random_camera
 from v3dg import Bundle, Camera, Scene, StereoCamera, select
 
-pytestmark = pytest.mark.slow  # the library is compiled first
+pytestmark = pytest.mark.slow  # slow, because the library is compiled first
 NUM_TRIALS = 300
 
 
@@ -101,7 +101,7 @@ def any_options(rng):
 
 
 def selected(scene, camera, options):
-    """Return the cut of Python and "", or None and the error message."""
+    """Return the cut of Python and an empty text, or None and the error message."""
     try:
         return select(scene, camera, device="cpu", **options), ""
     except ValueError as error:
@@ -221,7 +221,8 @@ def test_pairs_say_where_their_gaussians_are(opened):
 
 def test_cuts_of_resident_pages_and_what_they_miss(opened):
     """The cut and the priorities equal those of the core. Missing pages can be loaded
-    in the order of the list. Once all are loaded, the cut is that of all pages."""
+    in the order of the list. Once all of them are loaded, the cut is that of all
+    pages."""
     bundles, c_scene = opened
     num_missing = 0
     for seed in range(60):

@@ -1,5 +1,5 @@
-"""The C library is installed and found by CMake. The examples use it, and so does the
-first program on its page of the documentation."""
+"""The C library can be installed and found by CMake. The examples use it, and so does
+the first program on its page of the documentation."""
 
 import os
 import re
@@ -14,7 +14,7 @@ import c_library
 from scenes_lod import blob, lod_bundle
 from v3dg import Camera, Scene, select, write_scene
 
-pytestmark = pytest.mark.slow  # the library is compiled first
+pytestmark = pytest.mark.slow  # slow, because the library is compiled first
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "c_interface.md"
 LOOK = Camera.look_at((0, -3, 0.5), (0, 0, 0), (0, 0, 1), 0.8, width=1280, height=720, near=0.01)
@@ -38,7 +38,7 @@ def prefix(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def programs(prefix, tmp_path_factory):
-    """Return the folder of the examples, which are built from installed files only."""
+    """Return the folder of the examples. They are built from installed files only."""
     folder = tmp_path_factory.mktemp("programs")
     source = folder / "source"
     shutil.copytree(ROOT / "examples" / "c", source)
@@ -130,7 +130,7 @@ def test_the_page_opens_with_thirty_lines_that_select(prefix, bundle, tmp_path):
 
 
 def test_the_library_needs_no_python(prefix):
-    """The library needs only libraries of any C++ program with OpenMP."""
+    """The library only depends on libraries that any C++ program with OpenMP needs."""
     text = run("readelf", "-d", prefix / "lib" / "libv3dg.so")
     needed = set(re.findall(r"NEEDED.*\[(.*?)\.so", text))
     assert needed <= {

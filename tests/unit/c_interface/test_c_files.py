@@ -1,4 +1,4 @@
-"""The C library opens the same files as Python, and refuses others for the same
+"""The C library opens the same files as Python, and rejects others for the same
 reasons."""
 
 import json
@@ -20,12 +20,12 @@ from test_scene_file import GOOD, published_layout
 from v3dg import Bundle, read_scene
 from v3dg._json import is_one_line
 
-pytestmark = pytest.mark.slow  # the library is compiled first
+pytestmark = pytest.mark.slow  # slow, because the library is compiled first
 ROOT = Path(__file__).parents[3]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.v3dg"))
 NUM_CHANGES = 300
-# Only the C library refuses layouts of the paper, JSON strings with half of a surrogate
+# Only the C library rejects layouts of the paper, JSON strings with half of a surrogate
 # pair, JSON numbers that overflow a double, and `false` in place of 0 in a header.
 ONLY_IN_C = re.compile(
     "published with the V3DG paper|surrogate|number overflow|data_offsets.*false"
@@ -56,7 +56,7 @@ def c_error(path):
 
 
 def check_same(read, path):
-    """Compare the messages of both up to the value, whose text may differ."""
+    """Compare both messages up to the value, whose text may differ."""
     expected = python_error(read, path)
     found = c_error(path)
     if found is not None and ONLY_IN_C.search(found):
@@ -68,7 +68,7 @@ def check_same(read, path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return a folder with the bundles to which scenes of the corpus refer."""
+    """Return a folder with the bundles that scenes of the corpus refer to."""
     (tmp_path / "sub").mkdir()
     for name, bundle in BUNDLES.items():
         bundle.write(tmp_path / "written.v3dg")

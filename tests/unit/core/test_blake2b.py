@@ -19,7 +19,7 @@ def messages_of(lengths):
     data = np.random.default_rng(len(lengths)).integers(
         0, 256, max(lengths, default=0) + 64, np.uint8
     )
-    # Most of these messages are not aligned.
+    # Most of these messages are not aligned in memory.
     return [data[k % 64 : k % 64 + length] for k, length in enumerate(lengths)]
 
 

@@ -1,4 +1,4 @@
-"""The bounds that docs/numerics.md gives for needles and for large gaussians hold for
+"""The error bounds in docs/numerics.md for needles and for large gaussians hold for
 thousands of random ones."""
 
 import dataclasses
@@ -19,8 +19,8 @@ SEEDS = range(60)
 
 
 def needle_case(seed, mode):
-    """Return COUNT needles with one aspect ratio of 10² to 10⁶ and lengths of 0.1 to 30
-    units, and that ratio."""
+    """Return COUNT needles with lengths of 0.1 to 30 units. All have the same aspect
+    ratio, 10² to 10⁶, which is also returned."""
     rng = np.random.default_rng(10_000 + seed)
     aspect = 10.0 ** rng.uniform(2, 6)
     length = 10.0 ** rng.uniform(-1, 1.5)
@@ -51,7 +51,7 @@ def test_needles_without_a_filter_are_as_exact_as_their_aspect_lets_them_be(firs
 
 
 def gradient_distances(case):
-    """Return for each input: the distance of the float32 gradient from the float64
+    """For each input, return the distance of the float32 gradient from the float64
     gradient, the norm of its own gradient, and the norm of all gradients."""
     import torch
 
@@ -93,8 +93,8 @@ def test_small_shares_of_gradients_are_off_by_a_share_of_the_whole(mode):
 
 
 def test_depths_beyond_float32_are_not_drawn(device):
-    """They would be drawn at the principal point, and the depth of the picture would be
-    NaN."""
+    """Without a check, they would be drawn at the principal point, and the depth of the
+    picture would be NaN."""
     turned = scenes.CAMERAS["posed"]
     far = 3.6e38 * turned.viewmat[2, :3]
     beyond = scenes.gaussians(far[None], scales=0.3)
@@ -106,8 +106,8 @@ def test_depths_beyond_float32_are_not_drawn(device):
 
 
 def test_numbers_that_overflow_an_integer_are_no_harm():
-    """Positions and extents beyond 2³¹ px are defined, so UndefinedBehaviorSanitizer
-    reports nothing."""
+    """Positions and extents beyond 2³¹ px have defined results, so
+    UndefinedBehaviorSanitizer reports nothing."""
     means = np.float32(
         [[0, 0, 2], [1e20, 0, 2], [-1e20, 1e20, 2], [0, -1e38, 1], [1e38, 1e38, 1e38]]
     )

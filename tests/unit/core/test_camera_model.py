@@ -1,4 +1,4 @@
-"""The interface of camera models: a second model is projected with the same code as the
+"""The interface of camera models. A second model is projected with the same code as the
 pinhole."""
 
 import os
@@ -11,9 +11,9 @@ import pytest
 
 ROOT = Path(__file__).parents[3]
 CSRC = ROOT / "csrc"
-# Folders that draw pictures with pinhole cameras that they choose themselves; the
-# bindings and the C library, which create the cameras of users; and projection, which
-# has separate kernels for pinholes.
+# Folders that may name pinhole cameras: some draw pictures with cameras that they
+# choose themselves, the bindings and the C library create the cameras of users, and
+# projection has separate kernels for pinholes.
 USERS_OF_PINHOLES = {"camera", "fit_group", "levels", "bindings", "c_interface", "project"}
 # Sources that translate the fields of users' cameras.
 MAKERS_OF_CAMERAS = {
@@ -58,7 +58,7 @@ def test_boxes_of_directions_hold_every_point_of_a_gaussian(tmp_path: Path) -> N
 
 
 def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
-    """All other code names Intrinsics, so that another model needs only a file and an
+    """All other code names Intrinsics, so that another model only needs a file and an
     entry in camera/camera.h."""
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
     users = {p.parent.name for p in sources if "Pinhole<" in p.read_text(encoding="utf-8")}
@@ -66,7 +66,10 @@ def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
 
 
 def test_fields_of_a_pinhole_are_known_to_its_folder_alone() -> None:
-    """Other folders create a pinhole as a whole, and can scale and crop any camera."""
+    """Other folders only create a pinhole as a whole.
+
+    They can scale and crop any camera.
+    """
     field = re.compile(r"\bcamera\.(fx|fy|cx|cy)\b|[;{] *(camera|window)\.(width|height) =")
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
     users = {

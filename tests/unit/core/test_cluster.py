@@ -13,7 +13,8 @@ from devices import host, on
 from reference import cluster as reference
 from v3dg import _core
 
-# There are few distinct values, so that axes, coordinates and whole points are equal.
+# There are only a few distinct values, so that axes, coordinates and whole points are
+# often equal.
 coarse_means = hnp.arrays(
     np.float32,
     st.tuples(st.integers(0, 60), st.just(3)),
@@ -200,8 +201,8 @@ def test_balls_contain_their_spheres_with_margin(device, seed, count, num_segmen
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 100))
 def test_ball_is_nearly_the_smallest(device, seed, count):
     rng = np.random.default_rng(seed)
-    # These are points on the unit sphere and their opposites, so the smallest ball is
-    # the unit ball.
+    # The points are on the unit sphere, together with their opposites, so the smallest
+    # ball is the unit ball.
     half = rng.normal(size=(count, 3))
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     spheres = np.pad(np.concatenate([half, -half, 0.9 * half]), ((0, 0), (0, 1)))

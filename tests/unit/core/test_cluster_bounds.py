@@ -1,5 +1,4 @@
-"""Groups of eight clusters that are skipped together contain no cluster that is
-drawn."""
+"""When groups of eight clusters are skipped together, none of the clusters is drawn."""
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ TOGETHER = 8
 def may_draw(
     scene, camera, *, tolerance, min_level=0, footprint="solid_angle", cull=True, and_coarser=False
 ):
-    """Return for each instance which clusters may be drawn."""
+    """For each instance, return which clusters may be drawn."""
     rule = rule_of(tolerance, None, min_level, footprint, cull=cull)
     tables = [residency.table(bundle) for bundle in scene.bundles]
     flags, first = _core.bounds_may_draw(
@@ -33,7 +32,7 @@ def may_draw(
 
 
 def drawn(scene, camera, **options):
-    """Return for each instance which clusters are drawn."""
+    """For each instance, return which clusters are drawn."""
     cut = select(scene, camera, device="cpu", **options)
     masks = [np.zeros(len(scene.bundles[b].clusters.level), bool) for b in scene.instance_bundle]
     for i, c in zip(cut.instance_ids, cut.cluster_ids, strict=True):
@@ -42,8 +41,8 @@ def drawn(scene, camera, **options):
 
 
 def scene_of(rng):
-    """Return a scene, near or far, of trees of any shape and bundles with the layout of
-    a build."""
+    """Return a scene, near or far, with trees of any shape and bundles with the layout
+    of a build."""
     origin, size = rng.choice([0.0, 10.0, 1e4]), rng.choice([1e-3, 1.0, 100.0])
     asset = blob(rng, int(rng.integers(1, 400)), origin=origin, size=size)
     scene = random_scene(rng, lod_bundle(rng, asset, int(rng.integers(2, 30))), 6, spread=4 * size)

@@ -1,4 +1,4 @@
-"""Codebooks: the tables and palettes of SOG, and the order in which gaussians are
+"""Tests codebooks: the tables and palettes of SOG, and the order in which gaussians are
 written."""
 
 import numpy as np
@@ -44,7 +44,8 @@ def test_a_palette_that_has_room_is_exact():
 @pytest.mark.parametrize("count", [0, 1, 3000])
 def test_points_are_put_along_a_morton_curve(count):
     means = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
-    means[count // 2 :] = means[: count - count // 2]  # the first of these comes first
+    # the first of equal means comes first
+    means[count // 2 :] = means[: count - count // 2]
     np.testing.assert_array_equal(_core.morton_order(means), reference.morton_order(means))
 
 

@@ -41,8 +41,8 @@ def same_bits(first, second):
 
 
 def scenes_of(bundles, seed, count=40):
-    """Return scenes with the same instances: of encoded bundles, of decoded bundles,
-    and of both alternately."""
+    """Return three scenes with the same instances: of encoded bundles, of decoded
+    bundles, and of both alternately."""
     rng = np.random.default_rng(seed)
     pairs = [both(bundle) for bundle in bundles]
     poses = [
@@ -173,8 +173,8 @@ def test_a_bundle_keeps_codes_and_no_rows(tmp_path):
     codes.write(path)
     opened = Bundle.open(path)
     render(opened, scenes_lod.random_camera(np.random.default_rng(0)), device="cpu")
-    assert opened.codes is opened.codes  # kept
-    assert opened.gaussians is not opened.gaussians  # created again
+    assert opened.codes is opened.codes  # the codes are kept
+    assert opened.gaussians is not opened.gaussians  # gaussians are created again
     assert rows.codes is None
     for name, array in vars(opened.gaussians).items():
         assert array.tobytes() == getattr(rows.gaussians, name).tobytes(), name
@@ -182,7 +182,7 @@ def test_a_bundle_keeps_codes_and_no_rows(tmp_path):
 
 @pytest.mark.parametrize(("sh_degree", "most"), [(0, 18), (3, 48)])
 def test_memory_a_gaussian_stays_below_its_bound(device, sh_degree, most):
-    """The clusters have about 170 gaussians, as in builds; the tables count, too."""
+    """The clusters have about 170 gaussians, as in builds. The tables count, too."""
     codes, _ = both(lod_bundle(0, sh_degree, 20_000, 256))
     where = _device.resolve(device)
     render(codes, scenes_lod.random_camera(np.random.default_rng(0)), device=device).stats  # noqa: B018

@@ -1,4 +1,4 @@
-"""Fits of groups to pictures of the gaussians that they replace: views, loss and
+"""Tests fits of groups to pictures of the gaussians that they replace: views, loss and
 steps."""
 
 import math
@@ -17,7 +17,7 @@ torch = pytest.importorskip("torch")
 
 from reference import loss as reference  # noqa: E402
 
-# There is one view size, and pictures are neither smoothed nor shifted.
+# There is a single view size, and pictures are neither smoothed nor shifted.
 PLAIN = BuildConfig(
     image_size=32, supersample=1, filter_px2=0.0, num_views=16, views_per_step=1, first_steps=1000
 )
@@ -30,7 +30,7 @@ CENTER, RADIUS = np.float32([3.0, -2.0, 1.0]), 0.5
 def fit_groups(
     device, start, target, config, target_range, own_range, *, seed=0, streams=None, progress=None
 ):
-    """Fit groups that all lie in the ball (CENTER, RADIUS); return the result and the
+    """Fit groups that all lie in the ball (CENTER, RADIUS). Return the result and the
     residuals."""
     num_groups = len(own_range)
     fitted = on(device, copied(start))
@@ -55,8 +55,8 @@ def copied(gaussians):
 
 
 def fit(device, start, target, config, *, seed=0, stream=0, progress=None):
-    """Fit one group; return the result and its residuals, the mean |colour| and
-    |alpha|."""
+    """Fit one group. Return the result and its residuals, the mean absolute differences
+    of colour and alpha."""
     ranges = [[0, len(target)]], [[0, len(start)]]
     fitted, error = fit_groups(
         device, start, target, config, *ranges, seed=seed, streams=[stream], progress=progress
@@ -86,7 +86,7 @@ def in_ball(seed, num, **changes):
 
 def ball(opacity, color, scale=0.3, sh=None):
     """Return one round gaussian at the centre. It looks the same from everywhere,
-    except for `sh` above degree 0."""
+    except for the part of `sh` above degree 0."""
     return scenes.gaussians(CENTER, scales=scale * RADIUS, opacities=opacity, color=color, sh=sh)
 
 
@@ -136,7 +136,7 @@ def test_targets_are_supersampled(device):
 
 def mean_colour_over_views(device, coefficient, config, **options):
     """Return the mean colour of one SH coefficient over the views of a residual, in
-    standard deviations over the sphere."""
+    units of its standard deviation over the sphere."""
     sh = np.zeros((1, 16, 3), np.float32)
     sh[0, 0] = 0.5 / scenes.SH_C0  # a colour of 1 keeps all values above 0
     sh[0, coefficient] = 0.2
@@ -147,8 +147,8 @@ def mean_colour_over_views(device, coefficient, config, **options):
 
 @pytest.mark.parametrize("num_views", [1, 16])
 def test_views_held_out_lie_evenly_on_the_sphere(device, num_views):
-    """Functions on the sphere up to degree 2 have a smaller mean over these views than
-    over 8 random views."""
+    """The mean of functions on the sphere up to degree 2 is smaller over these views
+    than over 8 random ones."""
     config = replace(PLAIN, num_views=num_views)
     means = [
         mean_colour_over_views(device, k, config, seed=seed)
@@ -156,7 +156,8 @@ def test_views_held_out_lie_evenly_on_the_sphere(device, num_views):
         for seed in range(3)
     ]
     assert np.abs(means).max() < 0.2
-    assert np.sqrt(np.mean(np.square(means))) < 0.08  # random views would have 0.35
+    # with random views, it would be 0.35
+    assert np.sqrt(np.mean(np.square(means))) < 0.08
 
 
 def test_fresh_views_are_random_and_uniform(device):
@@ -180,7 +181,7 @@ def test_seed_and_stream_change_the_views(device):
 
 @pytest.mark.parametrize("num_views", [1, 4, 29, 58, 64])
 def test_every_view_is_looked_at(device, num_views):
-    """Views from all around teach the fit what is visible only from some directions."""
+    """Views from all directions show the fit what is only visible from some of them."""
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 0], sh[0, 1:] = 1.0, np.float32([[0.5], [-0.4], [0.3]])
     target = ball(0.9, (0, 0, 0), sh=sh)
@@ -261,8 +262,8 @@ def test_wrong_pictures_are_refused(picture, target):
 )
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_steps_are_those_of_adam(device, weights, views_per_step):
-    """A ball that looks the same from everywhere is also fitted with torch.optim.Adam
-    and differentiable pictures."""
+    """A ball that looks the same from everywhere is fitted, and also optimised with
+    torch.optim.Adam and differentiable pictures. The steps are equal."""
     steps = 25
     config = replace(
         PLAIN,
@@ -308,7 +309,7 @@ def test_first_step_has_the_sizes_that_were_set(device):
     )
     start, target = with_bases(start, 1), with_bases(target, 1)
     fitted, _ = fit(device, start, target, config)
-    assert not np.array_equal(fitted.sh, start.sh)  # it is better than the start
+    assert not np.array_equal(fitted.sh, start.sh)  # the fit is better than the start
 
     def logit(x):
         return np.log(x / (1 - x))
@@ -348,7 +349,7 @@ def test_longer_fits_come_closer(device, changes):
 
 def test_result_no_better_than_its_start_is_thrown_away(device):
     target = in_ball(6, 20)
-    # The fit is far better than no gaussians at all.
+    # With this start, the fit is far better than no gaussians at all.
     start = scenes.replaced(target, sh=target.sh + np.float32(0.05))
     _, before = fit(device, start, target, replace(PLAIN, steps=0))
     for step in ("step_position", "step_log_scale", "step_logit", "step_sh0"):
@@ -383,20 +384,20 @@ def test_result_that_pleases_only_the_views_it_was_fitted_to_is_thrown_away(devi
     ],
 )
 def test_nothing_runs_away(device, step, target):
-    """The target is outside the ball, larger than the ball or opaque, and is fitted
+    """The target is outside the ball, larger than the ball, or opaque. It is fitted
     with large steps."""
     start = ball(0.3, (1, 1, 1))
     out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 30.0}, steps=3))
     _, before = fit(device, start, target, replace(PLAIN, steps=0))
-    assert error.sum() < before.sum()  # the start was kept
+    assert error.sum() < before.sum()  # the initial values were kept
     assert np.abs(out.means - CENTER).max() <= RADIUS * (1 + 1e-6)
     assert out.scales.max() <= RADIUS * (1 + 1e-6)
     assert out.opacities.max() <= 1 - 0.99e-4
 
 
 def test_groups_do_not_touch_each_other(device):
-    """Two groups at once have the same results as each alone with its own stream of
-    random numbers."""
+    """Two groups that are fitted together have the same results as each alone with its
+    own stream of random numbers."""
     starts, targets = [in_ball(8, 12), in_ball(9, 7)], [in_ball(10, 30), in_ball(11, 20)]
     config = replace(PLAIN, steps=10)
     alone = [
@@ -458,7 +459,7 @@ def test_wrong_groups_are_named(change, message):
 
 
 def fit_one_group(start, target, change):
-    """Call the core with one or more arguments exchanged."""
+    """Call the core with one or more arguments replaced."""
     arguments = {
         "config": fit_config(PLAIN, 0, 0),
         "target": _core.FitTarget(target.rows, 0.0, False),
@@ -497,7 +498,7 @@ def test_what_is_fitted_has_to_be_where_its_target_is():
         fit_one_group(in_ball(15, 10), in_ball(15, 10), {"gaussians": there.rows})
 
 
-# ---- both halves
+# ---- both devices
 
 
 @pytest.mark.gpu
@@ -517,8 +518,8 @@ def test_what_is_fitted_has_to_be_where_its_target_is():
 )
 @pytest.mark.parametrize("steps", [0, 1, 5])
 def test_devices_agree(num, num_target, degree, changes, steps):
-    """Rounding changes most results hardly. Adam, however, makes whole steps from
-    gradients that consist of rounding only."""
+    """Rounding hardly changes most results. Adam, however, makes whole steps from
+    gradients that consist of rounding errors only."""
     start = with_bases(in_ball(16, num), degree)
     target = with_bases(in_ball(17, num_target), degree)
     config = replace(PLAIN, steps=steps, **changes)

@@ -18,8 +18,8 @@ def pairs(selection):
 
 
 def color_of(gaussians, n, direction):
-    """Return the colour of gaussian n towards a unit direction, by the definition of
-    the real harmonics."""
+    """Return the colour of gaussian n in a unit direction, by the definition of the
+    real harmonics."""
     x, y, z = direction
     basis = [0.28209479177387814]
     basis += [0.4886025119029199 * v for v in (-y, z, -x)]
@@ -87,12 +87,9 @@ def test_gaussians_are_those_of_the_instances_in_the_world(device, seed, sh_degr
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_harmonics_turn_as_the_bases_do(device, degree):
-    """The precision is 1e-12 although results are float32: all but one coefficient of a
-    band nearly vanish. Each row of the exact rotation, as coefficients of the asset,
-    becomes one basis function in the world, up to its rounding.
-
-    What a row of the true rotation stands for in the asset is, but for its rounding,
-    one basis in the world.
+    """The precision is 1e-12 although results are float32, because all but one
+    coefficient of a band nearly vanish. As coefficients of the asset, each row of the
+    exact rotation becomes one basis function in the world, up to rounding.
     """
     rng = np.random.default_rng(degree)
     count, size, first = 50, 2 * degree + 1, degree * degree
@@ -133,12 +130,12 @@ def test_harmonics_turn_as_the_bases_do(device, degree):
     for channel in range(3):
         error = np.abs(found[..., channel] - expected)
         assert error[:, off_diagonal].max() < 1e-12
-        assert error[:, ~off_diagonal].max() < 1e-7  # the next float32
+        assert error[:, ~off_diagonal].max() < 1e-7  # the nearest other float32
     assert (turned[:, :first] == 0).all()
 
 
 def mixed_selection():
-    """Return a selection from bundles of different SH degrees, of which some are placed
+    """Return a selection from bundles of different SH degrees, some of which are placed
     more than once."""
     rng = np.random.default_rng(8)
     low, high, unseen = (lod_bundle(rng, blob(rng, 60, sh_degree=d), 8) for d in (1, 3, 2))

@@ -26,7 +26,7 @@ from reference import rasterize as reference_rasterize
 from v3dg import _core
 
 CASES = pytest.mark.parametrize("name", hard_cases())
-# Cases that torch operations can differentiate quickly, and without 0 / 0.
+# Cases that torch operations can differentiate quickly and without 0 / 0.
 SMOOTH = [
     name
     for name, case in hard_cases().items()
@@ -81,8 +81,8 @@ def test_gradients_are_those_in_double(torch, device, name):
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gradients_in_double_are_autograds(torch, name):
-    """Expected are the gradients of a chain of torch operations that shares no formula
-    with the core."""
+    """The gradients are compared with those of a chain of torch operations that shares
+    no formula with the core."""
     from reference import rasterize_torch
 
     case = hard_cases()[name]
@@ -100,8 +100,8 @@ def test_gradients_in_double_are_autograds(torch, name):
 
 
 def test_maps_keep_their_detail(device):
-    """Details of 10⁻³ at coordinates of 10⁷ are an asset with its own frame, which an
-    instance places."""
+    """An asset with details of 10⁻³ has its own frame, which an instance places at
+    coordinates of 10⁷."""
     rng = np.random.default_rng(0)
     asset = scenes_lod.blob(rng, 400, size=0.02, sh_degree=1)
     bundle = scenes_lod.lod_bundle(rng, asset, 64)
@@ -132,8 +132,8 @@ def test_assets_far_from_their_zero_keep_their_detail(device, distance):
     scene.add(scenes_lod.lod_bundle(rng, asset, 64), (3.0, 5e4, -700.0), quaternion, scale)
     place = scene.positions[0] + scale * scene.rotations[0] @ center
     camera = v3dg.Camera.look_at(place + np.array([0.3, -9.0, 1.0]), place, width=70, height=50)
-    # This is the same camera in the frame of the asset, in which distances are divided
-    # by the scale.
+    # The same camera in the frame of the asset, where distances are divided by the
+    # scale.
     viewmat = np.eye(4)
     viewmat[:3, :3] = camera.viewmat[:3, :3] @ scene.rotations[0]
     eye = scene.rotations[0].T @ (camera.position - scene.positions[0]) / scale
@@ -185,9 +185,9 @@ def test_scene_out_of_sight_is_the_background(device, count):
 
 
 def test_more_pairs_than_31_bits_count(torch, device):
-    """Every pixel has stopped long before the 5,000th gaussian, so further gaussians
+    """Every pixel has stopped long before the 5,000th gaussian, so more gaussians
     change nothing."""
-    # There are 1920 x 1080 pixels in tiles of 32 x 16 or 32 x 32.
+    # The picture has 1920 x 1080 pixels, in tiles of 32 x 16 or 32 x 32.
     num, tiles = (550_000, 60 * 68) if device == "cuda" else (1_060_000, 60 * 34)
     assert num * tiles > 1 << 31
     if device == "cpu" and "V3DG_HUGE" not in os.environ:

@@ -1,4 +1,4 @@
-"""The instruction sets for which the CPU code is compiled."""
+"""Tests the instruction sets for which the CPU code is compiled."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ ISAS = ["baseline", "avx2", "avx512"]
 
 def run_with_isa(isa: str) -> subprocess.CompletedProcess[str]:
     code = "from v3dg import _core; print(_core.isa())"
-    # The child gets the parent's search path, so that both use the same v3dg.
+    # The child process gets the parent's search path, so that both use the same v3dg.
     environment = {
         **os.environ,
         "V3DG_ISA": isa,

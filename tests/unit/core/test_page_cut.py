@@ -1,5 +1,5 @@
-"""The cut of a scene of which only some pages are resident. It is exact, and it reports
-the pages that it misses."""
+"""The cut of a scene of which only some pages are resident is exact, and reports the
+pages that are missing."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ fades = st.sampled_from([None, 1.05, 4.0])
 
 
 def scene_of(rng, *, sh_degree=0):
-    """Return instances of two bundles: one has the layout of a build, and the other is
+    """Return instances of two bundles. One has the layout of a build, and the other is
     a tree of any shape."""
     asset = blob(rng, int(rng.integers(1, 400)), sh_degree=sh_degree)
     scene = random_scene(rng, lod_bundle(rng, asset, int(rng.integers(2, 30))), 5)
@@ -49,13 +49,13 @@ def scene_of(rng, *, sh_degree=0):
 
 
 def partly_there(rng, scene):
-    """Return for each bundle which pages are resident, and where."""
+    """For each bundle, return which pages are resident, and where they are."""
     there = [closed_residency(rng, bundle) for bundle in scene.bundles]
     return there, [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
 
 
 def a_tolerance(rng, scene, camera):
-    """Return the metric of some group, or a value near it."""
+    """Return the metric of some group, or a value close to it."""
     metrics = np.concatenate(group_metrics(scene, camera))
     metrics = metrics[np.isfinite(metrics)]
     return float(rng.choice(metrics)) * float(rng.choice([1.0, 0.7])) if len(metrics) else 1.0
@@ -122,7 +122,10 @@ def test_groups_are_refined_as_far_as_their_pages_have_faded_in(seed, fade):
 
 @pytest.mark.parametrize("fade", [None, 1.3])
 def test_violations_would_be_counted(fade):
-    """Pages without their ancestors would make a cut that is drawn twice."""
+    """If pages were resident without their ancestors, the cut would be drawn twice.
+
+    The test must detect this.
+    """
     rng = np.random.default_rng(0)
     bundle = random_trees(rng)[0]
     number, whole = numbers_of_clusters(bundle, rng)
@@ -192,7 +195,7 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
             ever[pages] = True
         for bundle, shift, pages in zip(scene.bundles, shifts, missing, strict=True):
             for page in pages:
-                while shift[page] == ABSENT:  # with all ancestors
+                while shift[page] == ABSENT:  # with all pages above it
                     shift[page] = 0
                     page = bundle.groups.parent[page]
     cut = core.select(camera.core, rule(**options))
@@ -200,10 +203,11 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
     np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
     np.testing.assert_array_equal(weights_of(cut), whole.weights)
-    # Missing pages are still needed, or are ancestors of pages that are nearly needed.
-    # Otherwise they would be evicted and be missing again.
+    # A missing page must still be needed, or be an ancestor of a page that is nearly
+    # needed. Otherwise it would be evicted and be missing again.
     for bundle, ever, need in zip(scene.bundles, asked, needs, strict=True):
-        above = np.append(bundle.groups.parent, -1)  # the coarsest page never counts
+        # the coarsest page never counts as missing
+        above = np.append(bundle.groups.parent, -1)
         needed = np.zeros(len(ever), bool)
         for asking in np.flatnonzero(need > 0):
             page = asking if need[asking] > 1 else above[asking]
@@ -286,8 +290,8 @@ def test_both_devices_choose_the_same_of_what_is_there():
 
 @pytest.mark.parametrize("fade", [None, 1.5])
 def test_pages_are_drawn_from_wherever_they_lie(device, fade):
-    """The cut of the same pages is the same if they lie in any order, with other rows
-    in between."""
+    """If the same pages lie in another order, with other rows in between, the cut is
+    the same."""
     rng = np.random.default_rng(2)
     for _ in range(5):
         scene = Scene()

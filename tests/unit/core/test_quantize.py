@@ -1,5 +1,5 @@
-"""Codes of gaussians: error bounds that follow from the steps, a second implementation
-of the formula, and extreme clusters."""
+"""Tests codes of gaussians: error bounds that follow from the steps, a second
+implementation of the formula, and extreme clusters."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ DEGREES = (0, 1, 2, 3)
 
 
 def random_clusters(seed, sh_degree, num_clusters=6, most=60):
-    """Return gaussians as in assets, in clusters of a unit of length at random places,
-    and where the clusters begin."""
+    """Return gaussians as in assets, in clusters of unit size at random places, and the
+    offsets of the clusters."""
     rng = np.random.default_rng(seed)
     sizes = rng.integers(1, most, num_clusters)
     n = int(sizes.sum())
@@ -48,7 +48,7 @@ def rounded(gaussians, offset):
 
 
 def ranges_of(values, offset):
-    """Return the least and the largest value (N, ...) in the cluster of each
+    """Return the smallest and the largest value (N, ...) in the cluster of each
     gaussian."""
     sizes = np.diff(offset)
     least, most = (
@@ -75,8 +75,8 @@ def covariances(gaussians):
 def test_errors_are_those_of_the_steps(seed, sh_degree):
     gaussians, offset = random_clusters(seed, sh_degree)
     out = rounded(gaussians, offset)
-    # The bound is half a step, and up to two steps at the upper end, because the step
-    # is rounded to 12 bits. Finally float32 rounds.
+    # The bound is half a step. At the upper end it is up to two steps, because the step
+    # is rounded to 12 bits. Finally, float32 rounds.
     least, most = ranges_of(gaussians.means, offset)
     step = (most - least) / 4095
     error = np.abs(out.means - gaussians.means.astype(np.float64))
@@ -85,7 +85,7 @@ def test_errors_are_those_of_the_steps(seed, sh_degree):
         error <= np.where(at_end, 2.5, 0.501) * step + np.spacing(np.abs(most).astype(np.float32))
     ).all()
     assert np.abs(out.opacities - gaussians.opacities).max() <= 0.5 / 255 + 1e-7
-    # The bound is half a step, or the part that is lost where the ends of the range are
+    # The bound is half a step, or the part that is lost when the ends of the range are
     # rounded inwards to float16.
     least, most = ranges_of(gaussians.sh[:, 0], offset)
     ends = np.maximum(np.abs(least), np.abs(most)) * 2.0**-10
@@ -98,15 +98,15 @@ def test_shapes_keep_to_their_steps(seed):
     """Covariances are compared, because the axes may have another order."""
     gaussians, offset = random_clusters(seed, 0)
     out = rounded(gaussians, offset)
-    # Half a step in the bits of floats is at most this relative error of a scale; the
+    # Half a step in the bits of floats is at most this relative error of a scale. The
     # ends of the range are coarser by 2^-8.
     bits = gaussians.scales.view(np.int32)
     least, most = ranges_of(np.stack([bits.min(1), bits.max(1)], axis=1), offset)
     relative = 0.5 * (most[:, 1] - least[:, 0]) / 1023 * 2.0**-23 + 2.0**-8
     error = np.abs(np.sort(out.scales, axis=1) / np.sort(gaussians.scales, axis=1) - 1).max(axis=1)
     assert (error <= relative).all()
-    # Three components have an error of half a step of 1/666 and w is at least 0.75, so
-    # the angle is at most 2 sqrt(3) / 1332 / 0.75.
+    # Three components have an error of half a step of 1/666, and w is at least 0.75.
+    # Therefore the angle is at most 2 sqrt(3) / 1332 / 0.75.
     angle = 2 * np.sqrt(3) * 0.5 / 666 / 0.74
     expected, got = covariances(gaussians), covariances(out)
     largest = gaussians.scales.max(axis=1).astype(np.float64) ** 2
@@ -128,8 +128,8 @@ def test_small_coefficients_have_small_steps(sh_degree):
             largest = ranges_of(np.abs(value).max(axis=1), offset)[1][:, None]
             most = 2 ** (reference.sh_bits(sh_degree, band)[channel] - 1) - 1
             unit = largest / most**2
-            # Steps are between the squares n² and (n+1)² of a unit that float16 stores
-            # with a relative error of 2^-11.
+            # A step lies between the squares n² and (n+1)², in a unit that float16
+            # stores with a relative error of 2^-11.
             assert (
                 error <= unit * (np.sqrt(np.abs(value) / unit) + 0.5) + largest * 2.0**-10
             ).all()
@@ -137,7 +137,7 @@ def test_small_coefficients_have_small_steps(sh_degree):
 
 @pytest.mark.parametrize("sh_degree", DEGREES)
 def test_the_formula_is_that_of_the_reference(sh_degree):
-    """The bits agree also if products are not rounded before they are added, because no
+    """The bits agree even if products are not rounded before they are added, because no
     code depends on it."""
     gaussians, offset = random_clusters(9, sh_degree)
     page = _core.encode_page(gaussians.rows, offset)
@@ -179,7 +179,7 @@ def extreme_clusters(rng, n, sh_degree):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_extreme_clusters_become_finite_gaussians_that_stay_as_they_are(seed):
-    """Decoded gaussians are encoded to the same page again, so an interrupted build
+    """Encoding decoded gaussians gives the same page again, so an interrupted build
     continues with the same values."""
     rng = np.random.default_rng(seed)
     for _ in range(150):

@@ -1,4 +1,4 @@
-"""The length of a quaternion has no influence: forward, backward, in scenes and in
+"""The length of a quaternion has no effect: forward, backward, in scenes and in
 files."""
 
 import numpy as np
@@ -11,14 +11,13 @@ from devices import host, on
 from v3dg.rotations import normalised
 from v3dg.viewer.view import View
 
-# Products with powers of two are exact, also if few bits are left.
+# Products with powers of two are exact, even if few bits are left.
 QUATS = np.array([[5, -3, 7, 2], [1, 6, -2, 4], [-7, 1, 0, 3], [0, 0, 5, 4]], np.float32) / 8
 EXPONENTS = (-125, -110, -86, -70, -64, -50, -41, -39, 39, 41, 49, 52, 63, 66, 100, 126)
 
 
 def crowd_turned_by(factor):
-    """Return ordinary gaussians that are rotated by QUATS, which are multiplied by
-    `factor`."""
+    """Return ordinary gaussians that are rotated by QUATS times `factor`."""
     num = hard_cases.NUM
     return hard_cases.crowd(5, quats=np.float32(factor) * np.resize(QUATS, (num, 4)))
 
@@ -60,7 +59,7 @@ def test_gradients_grow_as_one_over_the_length(device, exponent):
     expected[1] = expected[1] * 2.0**-exponent
     assert expected[1].any()
     for name, e, g in zip(scenes.NAMES, expected, got, strict=True):
-        # Values below the least normal number are rounded to subnormal numbers.
+        # Values below the smallest normal number are rounded to subnormal numbers.
         np.testing.assert_allclose(g, e, rtol=1e-6, atol=1e-37, err_msg=name)
 
 

@@ -188,7 +188,7 @@ def test_every_image_size(device, size):
 
 @st.composite
 def wild_gaussian(draw):
-    """Return one gaussian of any shape at any place that one of the cameras sees."""
+    """Return one gaussian of any shape at any position that one of the cameras sees."""
     log_scale = st.floats(-5, 1.5)
     place = st.floats(-3, 3, width=32)
     return scenes.gaussians(
@@ -236,8 +236,8 @@ def test_pixels_stop_behind_the_one_that_hides_the_rest(device, min_transmittanc
 
 @pytest.mark.parametrize("min_transmittance", [1e-4, 1e-3, 1e-2])
 def test_no_more_light_is_lost_than_asked_for(device, min_transmittance):
-    """This also holds for opaque gaussians, which take all light except a thousandth at
-    once."""
+    """This also holds for opaque gaussians, each of which takes all light except a
+    thousandth."""
     camera = scenes.CAMERAS["plain"]
     loose = scenes.trained_like(31, camera, 2000)
     gaussians = scenes.replaced(
@@ -267,8 +267,8 @@ def test_assets_are_drawn_as_rasterized_unless_asked(device):
     gaussians = scenes.trained_like(33, camera, 600)
     rendered = draw_stopped(device, gaussians, camera, None)
     expected = draw(device, gaussians, camera)
-    # On CUDA, an asset is drawn from covariances that were computed before, with other
-    # rounding.
+    # On CUDA, an asset is drawn from precomputed covariances, which are rounded
+    # differently.
     assert np.abs(rendered.color - expected.color).max() <= 1e-5
     stopped = draw_stopped(device, gaussians, camera, 1e-3)
     assert np.abs(stopped.color - expected.color).max() > 1e-4
@@ -337,13 +337,14 @@ def test_depths_too_far_apart_for_an_entry_keep_their_order(torch):
         leaf = gaussians.torch("cpu")
         leaf.opacities.requires_grad_(True)  # so that the picture is drawn as a whole
         pictures.append(v3dg.rasterize(leaf, camera).color.detach().numpy())
-    np.testing.assert_array_equal(*pictures)  # every pixel stops in front of the far gaussians
+    # every pixel stops in front of the far gaussians
+    np.testing.assert_array_equal(*pictures)
 
 
 @pytest.mark.parametrize("count", [300, 900, 3000, 9000])
 def test_depths_that_differ_in_their_last_bits_are_ordered(count):
-    """Lists are sorted by their leading bits first, and a far gaussian makes all others
-    alike in these. Equal depths keep the order of the array."""
+    """Lists are first sorted by their leading bits. A far gaussian makes all others
+    equal in these bits. Gaussians of equal depth keep the order of the array."""
     generator = np.random.default_rng(count)
     depths = (np.float32(2).view(np.uint32) + generator.integers(0, 40, count)).astype(np.uint32)
     depths = np.append(depths.view(np.float32), np.float32(1e6))
@@ -605,8 +606,8 @@ def test_each_coordinate_is_its_finite_difference(torch):
 
 
 def gradients_of(torch, gaussians, camera, dtype, device, *, background=BACKGROUND, **mode):
-    """Return the gradients of weighted_sum by the five inputs and the background, as
-    NumPy arrays."""
+    """Return the gradients of weighted_sum with respect to the five inputs and the
+    background, as NumPy arrays."""
     inputs = leaves(torch, gaussians, background, dtype, device)
     return host(
         torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
@@ -638,7 +639,7 @@ def test_gradients_of_every_degree(torch, device, sh_degree):
 
 @GRADIENT_MODES
 def test_gradients_over_many_tiles(torch, device, mode):
-    """Some gaussians cover hundreds of tiles and some a pixel, and some pixels stop
+    """Some gaussians cover hundreds of tiles, and some a single pixel. Some pixels stop
     early."""
     camera = scenes.camera(517, 389, fx=300.0, pose=scenes.pose(9))
     small = scenes.random_gaussians(
@@ -802,12 +803,13 @@ def test_gradient_descent_finds_a_moved_gaussian(torch, device):
         decay.step()
     x, y, depth = start.means.detach()[0].tolist()
     np.testing.assert_allclose([x / depth, y / depth], [0.075, -0.05], atol=0.001)
-    # The gaussian is larger than the target, so it moves to where it looks as small.
+    # The gaussian is larger than the target, so it moves to where it looks equally
+    # small.
     np.testing.assert_allclose(depth, 2.5, atol=0.05)
 
 
 def draw_with_gsplat(gsplat, torch, inputs, camera, filter_px2, antialiased=False):
-    """Return gsplat's colour, alpha and expected depth of the five inputs before the
+    """Return gsplat's colour, alpha and expected depth of the five inputs on the
     background."""
     view, K = (
         torch.tensor(m, dtype=torch.float32, device="cuda")[None]
@@ -831,7 +833,7 @@ def draw_with_gsplat(gsplat, torch, inputs, camera, filter_px2, antialiased=Fals
 
 @pytest.mark.gpu
 @pytest.mark.witness
-@pytest.mark.filterwarnings("ignore")  # because of what gsplat imports
+@pytest.mark.filterwarnings("ignore")  # gsplat's imports cause warnings
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("sh_degree", [0, 3])
 def test_pictures_and_gradients_are_gsplats(torch, antialiased, sh_degree):
@@ -881,8 +883,8 @@ np.savez(sys.argv[1], *out[0])
 
 
 def run_elsewhere(path, what, **environment):
-    """Return the arrays that RUN computes in its own process; None if the processor
-    lacks the instructions."""
+    """Return the arrays that RUN computes in a process of its own. Return None if the
+    processor lacks the instructions."""
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(path), what],
         env=TESTS_ENVIRONMENT | environment,

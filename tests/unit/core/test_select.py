@@ -24,7 +24,7 @@ from v3dg import BuildConfig, Bundle, Camera, Gaussians, Scene, _core, build_bun
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 seeds = st.integers(0, 2**32 - 1)
-# The position of the scene, and the distance of the cameras from it: far, inside, at
+# The position of the scene, and the distance of the cameras from it: far, inside, or at
 # the same place.
 places = st.sampled_from(
     [(0.0, 5.0), (0.0, 100.0), (0.0, 0.3), (0.0, 1e6), (1e6, 5.0), (-3e9, 50.0)]
@@ -60,7 +60,7 @@ def bundles(draw):
 
 
 def tolerances_of(draw, scene, camera):
-    """Return the tolerances 0, infinity, values in between, and exact metrics of
+    """Return the tolerances 0, infinity, some values in between, and exact metrics of
     groups."""
     metrics = np.concatenate([*group_metrics(scene, camera), np.zeros(1, np.float32)])
     exact = float(draw(st.sampled_from(sorted(set(metrics.tolist())))))
@@ -155,7 +155,7 @@ def test_cut_agrees_with_reference(seed, footprint, tolerance):
     camera = random_camera(rng)
     for metric in group_metrics(scene, camera, footprint=footprint):
         if (np.abs(metric - tolerance) <= 1e-3 * tolerance).any():
-            return  # rounding may decide
+            return  # rounding may decide here
     selection = select(
         scene, camera, tolerance=tolerance, footprint=footprint, cull=False, device="cpu"
     )
@@ -285,9 +285,9 @@ def test_frustum_never_drops_what_a_pixel_shows(seed, distance, off_center):
 
 @pytest.mark.parametrize("side", range(4))
 def test_frustum_keeps_needles_whose_image_leans_in(side):
-    # The needle lies beside the picture and along its border, past the eye. Its
-    # projection is linearised at its mean, which is outside the picture, so it is drawn
-    # across the border although the needle itself is not there.
+    # The needle lies next to the picture and along its border, past the eye. Its
+    # projection is linearised at its mean, which is outside the picture. Therefore it
+    # is drawn across the border, although the needle itself is not there.
     asset = Gaussians(
         means=np.zeros((1, 3), np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),
@@ -297,7 +297,7 @@ def test_frustum_keeps_needles_whose_image_leans_in(side):
     )
     bundle = lod_bundle(np.random.default_rng(0), asset, 1, past_root=0)
     # The rotation is an eighth of a turn about y, then a quarter of a turn about the
-    # view direction for each side.
+    # viewing direction for each side.
     (w, z), (c, y) = ((np.cos(a), np.sin(a)) for a in (side * np.pi / 4, np.pi / 8))
     turn = rotation_matrices(np.array([[w, 0, 0, z]]))[0]
     scene = Scene()
@@ -345,7 +345,8 @@ def test_bundles_of_different_filters_are_cut_as_if_alone(device, num_bundles):
         np.testing.assert_array_equal(cut.instance_ids[own], mine[expected.instance_ids])
         np.testing.assert_array_equal(cut.cluster_ids[own], expected.cluster_ids)
         kept.append(len(expected))
-    assert max(kept[:8]) > 1.5 * min(kept[:8])  # otherwise the filters would not matter here
+    # otherwise the filters would have no effect here
+    assert max(kept[:8]) > 1.5 * min(kept[:8])
 
 
 @given(bundle=bundles(), other=bundles(), seed=seeds)
@@ -459,8 +460,8 @@ OPTIONS = [{}, {"fade": 1.3}, {"min_level": 7}, {"footprint": "paper"}]
 
 
 def lane_scene(count):
-    """Return a camera, and instances that need a table, its last clusters, or only its
-    coarsest clusters, in every order."""
+    """Return a camera, and instances that need a whole table, its last clusters, or
+    only its coarsest clusters, in every order."""
     rng = np.random.default_rng(count)
     config = BuildConfig(cluster_size=32, steps=0, num_views=1)
     made = [build_bundle(blob(rng, size), config=config, progress=False) for size in (700, 40, 1)]
@@ -489,8 +490,8 @@ def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
 
 @pytest.mark.parametrize("options", OPTIONS)
 def test_many_instances_are_cut_as_each_alone(options):
-    """For many instances of a bundle, clusters are skipped that the distance
-    excludes."""
+    """For many instances of a bundle, clusters that the distance excludes are
+    skipped."""
     scene, camera = lane_scene(200)
     for tolerance in (0.1, 3.0, 100.0):
         whole = select(scene, camera, tolerance=tolerance, device="cpu", **options)

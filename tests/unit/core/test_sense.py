@@ -147,7 +147,8 @@ def test_a_gaussian_is_in_front_if_its_depth_is_smaller(depth, passed):
 
 
 def test_of_equal_weights_the_first_wins():
-    """The mesh has the weight that a gaussian of opacity 1/2 leaves, which is 1/2."""
+    """The mesh has the weight that a gaussian of opacity 1/2 leaves, which is also
+    1/2."""
     asset, camera = three_layers()
     layer = one_pixel(1.5, instance=np.int32(7), label=np.int32(3))
     channels = ("instance", "label", "weight")
@@ -178,7 +179,7 @@ def test_median_depth_is_where_at_most_half_of_the_light_is_left():
 
 
 def test_normals_face_the_camera():
-    """A disc seen from both sides."""
+    """The test draws a disc that is seen from both sides."""
     disc = scenes.gaussians([[0, 0, 2.0]], scales=[[0.5, 0.5, 0.01]], opacities=0.9)
     camera = scenes.camera(3, 3, fx=3.0)
     turned = scenes.replaced(disc, quats=np.float32([[0, 1, 0, 0]]))
@@ -218,7 +219,7 @@ def test_clipped_pixels_are_those_of_the_reference(seed):
 
 
 def test_small_tiles_and_windows_have_every_pixel():
-    """Test sizes that are not multiples of a tile or a block."""
+    """The sizes are not multiples of a tile or a block."""
     for width, height in ((1, 1), (33, 31), (70, 3)):
         camera = scenes.camera(width, height, fx=30.0)
         asset = with_flat_gaussians(1, camera, 40)
@@ -235,7 +236,10 @@ def assert_channels_or_empty(image, expected):
 
 
 def assert_like_cpu(image, expected, planes):
-    """Pixels near a cut-off may differ, as may ids of nearly equal weights."""
+    """Compare channels with those of the CPU.
+
+    Pixels near a cut-off may differ, as may ids of nearly equal weights.
+    """
     for plane in planes:
         got, wanted = host(getattr(image, plane)), getattr(expected, plane)
         assert got.dtype == wanted.dtype

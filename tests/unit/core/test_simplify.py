@@ -1,4 +1,5 @@
-"""The gaussians at which the fits of coarser clusters start: pruning and merging."""
+"""Tests the gaussians from which the fits of coarser clusters start: pruning and
+merging."""
 
 import itertools
 
@@ -69,7 +70,8 @@ def test_each_octant_keeps_its_share(device):
     corners = np.array(list(itertools.product([-1, 1], repeat=3)), np.float32)
     rng = np.random.default_rng(0)
     means = np.repeat(corners, 16, axis=0) + rng.uniform(-0.1, 0.1, (128, 3))
-    # All visible gaussians are in one corner, of which no more than its share survives.
+    # All visible gaussians are in one corner. No more than the corner's share of
+    # gaussians survives there.
     opacities = np.where(np.arange(128) < 16, 0.9, 0.01)
     kept = prune(device, scenes.gaussians(means, opacities=opacities), [128], [64])
     corner = np.round(kept.means).astype(int)
@@ -128,7 +130,7 @@ def test_equal_gaussians_merge_into_their_like(device):
     assert_close(one.means, g.means, MERGE_FLOAT)
     assert_close(np.sort(one.scales), np.sort(g.scales), MERGE_FLOAT)
     assert_close(one.opacities, 8 * g.opacities, MERGE_FLOAT)
-    # Ties are decided by index, so the first two are paired.
+    # Ties are broken by index, so the first two are paired.
     assert same(
         merge(device, copies, [8], [7]).subset(slice(1, None)), copies.subset(slice(2, None))
     )
@@ -189,7 +191,7 @@ def test_area_is_that_of_the_ellipsoid():
         assert abs(reference.area(scales) / (weight @ shadows.mean(axis=1) / 2) - 1) < 0.012
 
 
-# ---- both
+# ---- both operations
 
 
 @pytest.mark.parametrize("method", [merge, prune])

@@ -1,7 +1,7 @@
-"""Clang proves that guarded fields are used only while their mutex is held.
+"""Clang proves that guarded fields are only used while their mutex is locked.
 
-`.ci/check_threads.py` runs it, and here it is also given copies of the sources in which
-one lock is gone: it has to notice each.
+`.ci/check_threads.py` runs clang. The tests also run it on copies of the sources in
+which one lock is removed, which it must detect.
 """
 
 import importlib.util
@@ -58,8 +58,8 @@ def test_headers_that_no_source_includes_are_checked_alone():
     assert "base/ahead.h" in check("--list").stdout.split()
 
 
-# base/mutex.h wraps the types of the standard library. A child of fork() constructs the
-# mutex of the other file again.
+# base/mutex.h wraps the types of the standard library. In the other file, a child of
+# fork() constructs the mutex again.
 UNCHECKED = {"base/mutex.h", "bindings/python_lock.cpp"}
 
 
@@ -70,8 +70,8 @@ def test_clang_knows_every_mutex():
     assert {str(path.relative_to(CSRC)) for path in users} == UNCHECKED
 
 
-# The text that is removed, the file with it, the source that is then checked, and the
-# warning of clang.
+# For each fault: the text that is removed, its file, the source that is then checked,
+# and the warning of clang.
 BROKEN = {
     "a caller that does not lock": (
         "residency/page_pool.cpp",

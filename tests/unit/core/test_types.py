@@ -1,5 +1,5 @@
-"""Values that are passed to the compiled module. Each refuses wrong values and names
-them."""
+"""Values that are passed to the compiled module. Each class rejects wrong values and
+names them."""
 
 import re
 
@@ -109,7 +109,7 @@ def test_windows_outside_of_the_picture_are_refused(window):
 
 
 def test_window_leaves_the_camera_as_it_was():
-    """A window of a window can be made, too, anywhere in the picture."""
+    """A window of a window, anywhere in the picture, is possible, too."""
     camera = _core.Camera(**CAMERA)
     part = camera.window(10, 10, 20, 20)
     assert part is not camera
@@ -271,7 +271,7 @@ def test_operations_on_doubles_are_refused():
             operation(rows(np.float64))
 
 
-# ---- what takes values of ours
+# ---- functions that take these values
 
 
 def test_other_values_are_refused():
@@ -303,7 +303,7 @@ def test_other_values_are_refused():
 
 def test_frame_refuses_a_scene_of_other_bundles():
     """A frame may have the gaussians of bundles that the scene does not have yet, but
-    not those of other bundles in their places."""
+    not those of other bundles in place of the scene's."""
     bundles = [random_bundle(seed) for seed in (1, 2)]
     one, two = map(residency.table, bundles)
     for has, tables in (

@@ -1,5 +1,5 @@
-"""Builds in parts: plans from counts, subtrees that are built alone and in any order,
-and files that receive finished parts."""
+"""Tests builds in parts: plans from counts, subtrees that are built alone and in any
+order, and files that receive finished parts."""
 
 from dataclasses import asdict, fields, replace
 from functools import partial
@@ -66,8 +66,8 @@ def part_of(level, plan, part):
 
 
 def build_subtree(leaves, plan, config, codec, level, first_group, last_group):
-    """Return the levels above the leaves under a run of groups, built from these leaves
-    alone, and their plan."""
+    """Return the levels above the leaves under a run of groups, and their plan. They
+    are built from these leaves alone."""
     part = plan.subtree(level, first_group, last_group)
     bottom = part.levels[0].first_group
     rows = plan.levels[0].offset[[bottom, bottom + part.levels[0].num_groups]]
@@ -136,7 +136,7 @@ def test_plan_of_a_subtree_is_a_part_of_the_plan():
     ("name", "codec"), [*((name, "float32") for name in CONFIGS), ("ours", "quantized")]
 )
 def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
-    """The subtree is the same whatever is built beside it, below any level, and in any
+    """The subtree is the same whatever is built next to it, below any level, and in any
     order."""
     config = CONFIGS[name]
     leaves, plan = in_split_order(asset, config), Plan.of(len(asset), config)
@@ -160,7 +160,7 @@ def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", ["ours", "groups_of_4"])
 def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
-    """The pages of a subtree are written when it is finished; the levels above are
+    """The pages of a subtree are written when it is finished. The levels above are
     built from the decoded pages."""
     config = CONFIGS[name]
     options = {"config": config, "seed": SEED, "progress": False, "device": "cpu", "codec": codec}
@@ -239,7 +239,7 @@ def test_units_hold_all_leaves_and_no_more_than_asked():
             units = plan.units(most)
             sizes = [part.levels[0].num_gaussians for part in units]
             assert sum(sizes) == count
-            assert max(sizes) <= max(most, 2 * 256)  # no page is shared
+            assert max(sizes) <= max(most, 2 * 256)  # no two units share a page
             assert len({len(part.levels) for part in units}) == 1
 
 
@@ -263,13 +263,13 @@ def test_a_file_is_built_as_a_bundle_is(asset, codec, tmp_path):
     parts = (opened.clusters, opened.groups, opened.gaussians, opened.config)
     v3dg.Bundle(*parts, other).write(tmp_path / "out.v3dg")
     again = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
-    assert again[1]  # later conversions are not what was built
+    assert again[1]  # later conversions are not the result of a build
     assert (tmp_path / "out.v3dg").read_bytes() == (tmp_path / "memory.v3dg").read_bytes()
 
 
 def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
-    """The file is overwritten if the build does not continue; remains of another file
-    stay."""
+    """If the build does not continue, the file is overwritten. Remains of another file
+    are kept."""
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     left = [levels_path(tmp_path / f"{name}.v3dg") for name in "ab"]
     for path in left:
@@ -302,8 +302,8 @@ def test_a_built_file_has_the_permissions_of_a_written_one(asset, tmp_path, mode
 
 def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatch):
     v3dg.write_asset(tmp_path / "asset.ply", asset)
-    # A part alone would measure again whether the asset is smooth, with fits that are
-    # not those of its levels.
+    # A part alone would measure again whether the asset is smooth, with fits that
+    # differ from those of its levels.
     options = {"config": replace(SMALL, smooth="no"), "progress": False, "device": "cpu"}
 
     def interrupt(*_):

@@ -66,8 +66,8 @@ def assert_same(got, expected):
 
 @pytest.fixture
 def small(monkeypatch):
-    """Read few gaussians at a time, as if memory were much smaller than the least that
-    is allowed."""
+    """Read few gaussians at a time, as if there were much less memory than the minimum
+    that is allowed."""
 
     def sizes(block=1 << 16, node=100, bucket=20):
         chosen = on_disk._Sizes(0, block, node, bucket)
@@ -462,7 +462,7 @@ def test_scratch_in_use_and_files_of_others_are_kept(tmp_path, small):
     ):
         pass
     assert (tmp_path / "s" / "letter").read_text() == "dear"
-    # Scratch files have such a name, too.
+    # Scratch files have such a name, too, so the file is moved to it.
     (tmp_path / "s" / "letter").rename(tmp_path / "s" / "order")
     with (
         pytest.raises(

@@ -31,7 +31,8 @@ def faint_cloud():
 
 @pytest.fixture(scope="module")
 def dark_ball():
-    """Return a ball of 3,000 gaussians whose median is dark and whose mean is not."""
+    """Return a ball of 3,000 gaussians whose median colour is dark, but whose mean
+    colour is not."""
     rng = np.random.default_rng(3)
     count = 3_000
     outwards = rng.normal(size=(count, 3))
@@ -65,7 +66,7 @@ def totals(image):
 
 def ratios(asset, bundle, width, device):
     """Return the total colour and alpha (4,) of the cut at the default tolerance,
-    divided by those of the asset at many samples per pixel."""
+    divided by those of the asset, which is drawn with many samples per pixel."""
     of_cuts = np.zeros(4)
     of_asset = np.zeros(4)
     for camera in cameras(width):
@@ -81,7 +82,8 @@ def test_cuts_of_a_faint_asset_keep_its_alpha_and_colour(faint_cloud, device):
 
 
 def test_a_fit_by_pixels_alone_loses_alpha(faint_cloud):
-    """The medians of sparse pixels are below their means."""
+    """Without the loss of cells, alpha is lost, because the medians of sparse pixels
+    are below their means."""
     config = BuildConfig(loss_cells=0.0, smooth="no")
     bundle = v3dg.build_bundle(faint_cloud, config=config, device="cpu", progress=False)
     assert (ratios(faint_cloud, bundle, 14, "cpu") < 0.96).all()
@@ -104,7 +106,7 @@ def test_a_faint_asset_has_no_filter(faint_cloud):
 
 @pytest.fixture(scope="module")
 def drafts(faint_cloud, dark_ball):
-    """Return bundles as they are built."""
+    """Return bundles that are not refined."""
     return [
         (asset, v3dg.build_bundle(asset, device="cpu", progress=False, quality="draft"))
         for asset in (faint_cloud, dark_ball)

@@ -1,4 +1,5 @@
-"""The viewpoints of a refinement's pictures, which are found without photographs."""
+"""Tests the viewpoints of a refinement's pictures, which are found without
+photographs."""
 
 import functools
 

@@ -1,5 +1,5 @@
-"""Batches of cameras: the pictures, decisions and counts equal those of each camera
-alone; environments, planes of the caller, and refused values."""
+"""Tests batches of cameras. The pictures, decisions and counts equal those of each
+camera alone. Also tests environments, planes of the caller, and wrong values."""
 
 import dataclasses
 
@@ -118,8 +118,8 @@ def test_a_list_of_cameras_keeps_false_colors(scene, device, color_by):
 
 
 def test_many_random_cameras_choose_the_same(tinted_scene, device):
-    """The counts of selected gaussians agree for 64 x 90 random pairs of camera and
-    instance."""
+    """The numbers of selected gaussians agree for 64 x 90 random pairs of a camera and
+    an instance."""
     cameras = cameras_around(64, seed=6, width=16, height=16)
     renderer = v3dg.Renderer(tinted_scene, device=device)
     for fade in (None, 1.3):
@@ -216,8 +216,7 @@ def worlds(num_environments=5, seed=11):
 
 
 def part_of(scene, environment):
-    """Return the instances that a camera of an environment sees, first the shared
-    ones."""
+    """Return the instances that a camera of an environment sees, shared ones first."""
     shared = np.flatnonzero(scene.environments == -1)
     own = np.flatnonzero((scene.environments == environment) & (environment >= 0))
     rows = np.concatenate([shared, own])
@@ -443,8 +442,8 @@ def test_a_graph_draws_what_its_tensors_contain(scene, options):
 
 @pytest.mark.gpu
 def test_a_batch_waits_for_nothing(scene):
-    """A batch copies nothing to the host, so a kernel that sleeps before it does not
-    delay the call."""
+    """A batch copies nothing to the host. Therefore a kernel that sleeps before it does
+    not delay the call."""
     import torch
 
     batch = tensors_of(cameras_around(6, seed=20))
@@ -488,7 +487,9 @@ def test_buffers_grow_for_callers_that_ignore_results(scene):
     renderer = v3dg.Renderer(scene, device="cuda")
     renderer.render_batch([far] * 24)
     planes = BatchPlanes(torch.zeros(24, HEIGHT, WIDTH, 3, device="cuda"))
-    for _ in range(4):  # first items and gaussians are counted, then entries, then long lists
+    # the first buffer that overflows is that of items and gaussians, then that of
+    # entries, then that of long lists
+    for _ in range(4):
         renderer.render_batch([near] * 24, tolerance=0.0, out=planes)
         torch.cuda.synchronize()
     alone = v3dg.render(scene, near, tolerance=0.0, device="cuda")
@@ -519,7 +520,8 @@ def test_more_gaussians_than_a_frame_can_have_are_drawn_in_parts():
     assert batch.stats.num_parts > 1
     alone = v3dg.render(scene, cameras[63], tolerance=0.0, device="cuda")
     np.testing.assert_array_equal(host(batch.color[63]), host(alone.color))
-    again = renderer.render_batch(cameras[:2], tolerance=0.0)  # has no error of the parts before
+    # the error of an earlier part is not reported again
+    again = renderer.render_batch(cameras[:2], tolerance=0.0)
     np.testing.assert_array_equal(host(again.color[0]), host(batch.color[0]))
     # Batches that fit are soon drawn as a whole.
     parts = [renderer.render_batch(cameras, tolerance=50.0).stats.num_parts for _ in range(16)]

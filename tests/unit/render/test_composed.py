@@ -1,5 +1,5 @@
-"""Composed scenes: instances are added, removed and moved; budgets, cuts that are drawn
-later, and false colours."""
+"""Tests composed scenes: adding, removing and moving instances, budgets, drawing
+earlier cuts, and false colours."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ from reference import select as reference
 from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import Scene, select
 
-# Neighbours among the tolerances from which a budget chooses differ by this number in
-# the bits of float32.
+# Neighbouring tolerances from which a budget chooses differ by this number in the bits
+# of float32.
 STEP_BITS = 1 << 12
 
 
@@ -150,7 +150,7 @@ def test_nothing_finer_than_the_least_level(device, min_level):
 
 
 def rebuilt(scene):
-    """Return a new scene with the same instances, which are added run by run."""
+    """Return a new scene with the same instances, added run by run."""
     fresh = Scene()
     for i in range(len(scene)):
         fresh.add(
@@ -310,7 +310,7 @@ def test_cut_can_be_kept_while_the_camera_moves(device):
     kept = render(scene, other, cut=everything, device=device)
     assert kept.stats.gaussians_selected == everything.num_gaussians
     assert kept.stats.tolerance == 0.5
-    # The asset is drawn from the same gaussians in the world.
+    # The asset is drawn from the same gaussians in world space.
     own = render(scene, other, tolerance=0.5, device=device)
     assert not np.array_equal(host(kept.color), host(own.color))
     nothing = select(
@@ -353,8 +353,8 @@ def test_both_devices_choose_the_same():
 
 @pytest.mark.gpu
 def test_budgets_before_do_not_matter():
-    # There are few clusters, many of them at the borders of the picture, so a coarser
-    # cut can have more gaussians.
+    # There are few clusters, many of them at the borders of the picture. Therefore a
+    # coarser cut can have more gaussians.
     rng = np.random.default_rng(19)
     for _ in range(20):
         scene = random_scene(rng, lod_bundle(rng, blob(rng, 120), 8), 3, spread=1)

@@ -1,4 +1,4 @@
-"""Fades between levels: weights add up to one and scale opacities, and no picture
+"""Tests fades between levels. Weights add up to one and scale opacities, and no picture
 changes suddenly."""
 
 from dataclasses import replace
@@ -51,8 +51,8 @@ def same(a, b):
 
 
 def weights_of(selection, i, bundle):
-    """Return the weights (C,) of the clusters of one instance, 0 for clusters that are
-    not drawn."""
+    """Return the weights (C,) of the clusters of one instance, or 0 for clusters that
+    are not drawn."""
     weights, mine = np.zeros(len(bundle.clusters)), selection.instance_ids == i
     weights[selection.cluster_ids[mine]] = selection.weights[mine]
     return weights
@@ -181,7 +181,7 @@ def test_budget_is_kept_in_steps(seed, fade, share):
 
 
 def slow_orbit(num_frames):
-    """Return cameras that move towards CAMERA, while clusters enter and leave the
+    """Return cameras that move towards CAMERA while clusters enter and leave the
     view."""
     angles = 2e-3 * np.arange(num_frames)[::-1]
     eyes = [(6 * np.sin(a), -6 * np.cos(a), 1) for a in angles]
@@ -189,7 +189,7 @@ def slow_orbit(num_frames):
 
 
 def settled_at(renderer, camera, options):
-    """Return the tolerance at which ten pictures of a camera at rest are the same
+    """Return the tolerance at which ten pictures of a camera at rest have the same
     bits."""
     first, *others = (renderer.render(camera, **options) for _ in range(10))
     for image in others:
@@ -201,8 +201,8 @@ def settled_at(renderer, camera, options):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("memory", [None, "64MB"])
 def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, memory):
-    """From the first picture on if the view is new; after slow motion, the budget
-    reaches the same picture in steps."""
+    """If the view is new, the first picture has these bits. After slow motion, the
+    budget reaches the same picture in steps."""
     scene = composed_scene(np.random.default_rng(5))
     options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
     last = cameras[-1]
@@ -220,7 +220,7 @@ def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, me
         ways.append(np.log2(roomy / renderer.render(last, **options).stats.tolerance))
     steps = -np.diff(ways)
     assert ways[0] > 0.04
-    # The values of an octave have equal distances.
+    # The tolerances within an octave are equally spaced.
     assert 0 <= steps.min() <= steps.max() < 2.1 * ways[0] / 8
     assert settled_at(renderer, last, options) == roomy
 
@@ -292,7 +292,7 @@ def test_without_a_fade_a_budget_depends_on_the_view_alone():
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_cuts_that_follow_each_other_are_those_of_a_renderer(device):
-    """This also holds for the cuts of two viewers by turns."""
+    """This also holds if two viewers select cuts in turn."""
     scene, where = composed_scene(np.random.default_rng(5)), _device.resolve(device)
     options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
     viewers = [(Renderer(scene, device=device), _core.BudgetSteps()) for _ in range(2)]
@@ -336,7 +336,7 @@ def test_turning_in_place_changes_no_weight(device):
 
 
 def faded(bundle, opacities, weights, device):
-    """Return the opacities multiplied by the weights of clusters with one gaussian
+    """Return the opacities multiplied by the weights of clusters that have one gaussian
     each."""
     count = len(opacities)
     cut = Selection(
@@ -352,8 +352,8 @@ def faded(bundle, opacities, weights, device):
 
 
 def singles(opacities):
-    """Return a bundle of this number of leaf clusters side by side, with one gaussian
-    each."""
+    """Return a bundle of this number of leaf clusters next to each other, with one
+    gaussian each."""
     count = len(opacities)
     means = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], 1).astype(np.float32)
     asset = Gaussians(
@@ -400,12 +400,12 @@ def test_picture_is_that_of_the_gaussians_with_faded_opacities(device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("filter_px2", "is_antialiased"), [(0.0, 0), (0.3, 0), (0.02, 1)])
 def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased, device):
-    """Level 0 also has the filter while nothing fades, so that the picture does not
-    change as a whole when a fade begins."""
+    """Level 0 has the filter even while nothing fades. Otherwise the whole picture
+    would change when a fade begins."""
     rng = np.random.default_rng(3)
     asset = blob(rng, 900)
-    # The gaussians are about a unit large; none is so narrow that it gets a smaller
-    # filter.
+    # The gaussians are about one unit large, and none is so narrow that it gets a
+    # smaller filter.
     px = CAMERA.fx / np.linalg.norm(CAMERA.position)
     asset = replace(asset, scales=np.clip(asset.scales, 0.2 / px, 0.5 / px).astype(np.float32))
     bundle = lod_bundle(rng, asset, 32)
@@ -442,8 +442,8 @@ def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased,
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("distance", [3, 10, 30, 60])
 def test_a_surface_of_tiny_gaussians_does_not_become_transparent(distance, device):
-    """The gaussians are far smaller than the filter, so that each alone would have less
-    than the least alpha that is drawn."""
+    """The gaussians are far smaller than the filter. Each alone would have an alpha
+    below the smallest one that is drawn."""
     rng = np.random.default_rng(1)
     means = rng.normal(size=(50_000, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -466,8 +466,8 @@ def test_a_surface_of_tiny_gaussians_does_not_become_transparent(distance, devic
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_levels_that_are_drawn_alike_without_a_fade_are_not_with_one(device):
-    """The last clusters of level 0 and the first of level 1 are drawn one after the
-    other, each with its own filter."""
+    """The last clusters of level 0 and the first of level 1 are drawn directly one
+    after the other, each with its own filter."""
     rng = np.random.default_rng(5)
     bundle = lod_bundle(rng, blob(rng, 240, size=0.02), 60, filter_px2=0.0)
     clusters = replace(bundle.clusters, antialiased=np.ones_like(bundle.clusters.antialiased))

@@ -1,5 +1,5 @@
 """Frames on CUDA equal the pictures of the CPU, whatever the stream, the buffers and
-the frames before."""
+the earlier frames."""
 
 import gc
 from dataclasses import replace
@@ -16,7 +16,7 @@ from v3dg import Camera, Gaussians, Scene, rasterize, select
 pytestmark = pytest.mark.gpu
 
 BACKGROUND = (0.1, 0.2, 0.3)
-# Parts of a frame's memory that are not of the pool.
+# Parts of a frame's memory that are not from the pool.
 IN_PLACE = {"records", "entries", "scratch", "large"}
 
 
@@ -32,8 +32,8 @@ def test_scene_looks_as_on_the_cpu(sh_degree, tolerance):
 @pytest.mark.parametrize("sh_degree", [0, 3])
 @pytest.mark.parametrize("tops", [5, 20, 150])
 def test_neighbours_that_share_a_cluster_look_as_on_the_cpu(sh_degree, tops):
-    """The instances are so far that their coarsest clusters are drawn: alone, several
-    at once, and of two bundles by turns."""
+    """The instances are so far away that their coarsest clusters are drawn. Instances
+    are drawn alone, several at once, and of two bundles in turn."""
     rng = np.random.default_rng(tops)
     bundles = [
         scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), tops, past_root=0)
@@ -95,7 +95,7 @@ def test_gaussians_over_thousands_of_tiles(size):
 )
 @pytest.mark.parametrize("count", [3000, 60_000])
 def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
-    """Few tiles have most of the entries. A frame that keeps a tape does not blend
+    """A few tiles have most of the entries. A frame that keeps a tape does not blend
     tiles in parts."""
     rng = np.random.default_rng(count)
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=640, height=400)
@@ -103,7 +103,7 @@ def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
     depth = rng.uniform(*ranges.get(depths, (2, 2)), count)
     if depths == "one before all":
         depth[0] = 0.02
-    if depths == "in one step":  # of the depths by which lists are sorted
+    if depths == "in one step":  # the depths by which lists are sorted
         depth = np.where(rng.random(count) < 0.5, depth, np.nextafter(np.float32(2), np.float32(3)))
     if depths == "on sheets":
         depth += rng.integers(0, 7, count) ** 2
@@ -161,8 +161,8 @@ def test_nothing_gives_the_background(subject):
 
 
 def test_buffers_that_were_too_small_leave_no_trace():
-    """The first frame of a renderer has hardly any memory; later frames have as much as
-    the frames before needed."""
+    """The first frame of a renderer has hardly any memory. Later frames have as much as
+    earlier frames needed."""
     subject = composed_scene(np.random.default_rng(3))
     renderer = Renderer(subject)
     first, second = (renderer.render(CAMERA, tolerance=0.0) for _ in range(2))
@@ -195,7 +195,7 @@ def crowd():
 
 
 def drawn(renderer):
-    """Return the number of gaussians of a frame of all gaussians, which is done."""
+    """Return the number of gaussians of a finished frame that draws all gaussians."""
     return renderer.render(CAMERA, tolerance=0.0).stats.gaussians_selected
 
 
@@ -295,7 +295,7 @@ def test_a_graph_draws_again(options):
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         image = renderer.render(CAMERA, **options)
-    # Other pictures are drawn in between, which need other buffers.
+    # Other pictures are drawn in between. They need other buffers.
     other = renderer.render(CAMERA.scaled(4), tolerance=0.0)
     other.stats  # noqa: B018  waits
     for _ in range(3):
@@ -315,7 +315,8 @@ def test_a_graph_of_what_was_not_drawn_before_is_refused():
 
     def assert_refused():
         with torch.cuda.graph(torch.cuda.CUDAGraph()):
-            torch.zeros(1, device="cuda")  # because torch warns of empty graphs
+            # torch warns about empty graphs, so enqueue something
+            torch.zeros(1, device="cuda")
             with pytest.raises(RuntimeError, match=r"draw .* once before the capture"):
                 renderer.render(CAMERA)
 

@@ -123,8 +123,8 @@ def test_a_given_cut_skips_what_has_become_invisible(device):
 
 
 def crowd(rng, count=90):
-    """Return instances of two bundles, each with its own factors, near and far;
-    neighbours share coarse clusters."""
+    """Return instances of two bundles, near and far, each with its own factors.
+    Neighbours share coarse clusters."""
     scene = Scene()
     for seed, sh_degree in ((0, 0), (1, 2)):
         scene.add(

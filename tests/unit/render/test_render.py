@@ -50,6 +50,6 @@ def test_asset_and_bundle_are_seen_from_the_same_place(device):
         for name in ("color", "alpha", "depth"):
             error = np.abs(host(getattr(picture, name)) - host(getattr(as_bundle, name)))
             assert error.max() < 2e-4, name
-            # Depths are near 6, where the steps of float32 are 5e-7; packed values are
+            # Depths are near 6, where the spacing of float32 is 5e-7. Packed values are
             # rounded once more.
             assert error.mean() < 3e-6, name

@@ -1,4 +1,4 @@
-"""Requests as they are passed to the core: cuts, and the content of pixels."""
+"""Tests requests as they are passed to the core: cuts, and what pixels show."""
 
 import itertools
 
@@ -88,7 +88,7 @@ def test_the_stop_grows_with_the_tolerance_of_the_cut():
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_pixels_of_cuts_stop_by_their_tolerance(bundle, device, tolerance):
-    """This also holds for both eyes, for a cut that was selected before, and with a
+    """This also holds for both eyes, for a cut that was selected earlier, and with a
     pool."""
     stop = _core.stop_of_tolerance(tolerance)
     options = {"tolerance": tolerance, "device": device}
@@ -117,7 +117,8 @@ def test_pixels_of_a_budget_stop_by_the_tolerance_that_meets_it(bundle, device, 
 
 
 def test_a_cut_of_level_0_is_no_worse_than_its_asset(asset, bundle, device):
-    """The default tolerance is used near the asset, where the whole cut is level 0."""
+    """The default tolerance is used close to the asset, where the whole cut is level
+    0."""
     near = Camera.look_at((0, -1.5, 0), (0, 0, 0), width=480, height=400)
     truth = v3dg.rasterize(asset, near)
     picture = v3dg.render(bundle, near, device=device)

@@ -33,7 +33,7 @@ def camera_at(eye=(0, -6, 1)):
 
 
 def mesh_of(shape, seed=0, **planes):
-    """Return a mesh before, between and behind the gaussians of the scene."""
+    """Return a mesh in front of, between and behind the gaussians of the scene."""
     rng = np.random.default_rng(seed)
     coverage = rng.choice([0.0, 0.4, 1.0], shape)
     depth = np.exp(rng.uniform(np.log(0.03), np.log(30), shape))
@@ -274,8 +274,8 @@ def draw_window(scene, cut, window, mesh):
 
 
 def test_parts_of_a_picture_have_its_bits():
-    """The whole picture has so many gaussians that it is drawn in bands, whereas each
-    of its halves is drawn at once."""
+    """The whole picture has so many gaussians that it is drawn in bands, but each of
+    its halves is drawn at once."""
     rng = np.random.default_rng(1)
     bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 400, size=0.2), 64)
     scene = Scene()

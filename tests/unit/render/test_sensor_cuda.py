@@ -1,5 +1,6 @@
-"""Tests channels and meshes on a CUDA device: against the CPU, bit for bit between
-batches, single pictures, planes of the caller and graphs, and tensors of meshes."""
+"""Tests channels and meshes on a CUDA device. They are compared with the CPU, and bit
+for bit between batches, single pictures, planes of the caller and graphs. Also tests
+meshes as tensors."""
 
 import dataclasses
 
@@ -50,7 +51,7 @@ def cameras_around(count, radius=6.0):
 
 
 def mesh_of(shape, seed=0, **planes):
-    """Return a mesh before, between and behind the gaussians of the scene."""
+    """Return a mesh in front of, between and behind the gaussians of the scene."""
     rng = np.random.default_rng(seed)
     coverage = rng.choice([0.0, 0.4, 1.0], shape)
     normal = rng.normal(size=(*shape, 3))
@@ -107,7 +108,10 @@ def assert_same(image, other, planes=PLANES):
 
 
 def assert_like_cpu(image, expected, planes=PLANES, share=0.01):
-    """Pixels near a cut-off may differ, as may ids of nearly equal weights."""
+    """Compare channels with those of the CPU.
+
+    Pixels near a cut-off may differ, as may ids of nearly equal weights.
+    """
     for plane in planes:
         got = host(getattr(image, plane))
         wanted = getattr(expected, plane)
@@ -120,7 +124,7 @@ def assert_like_cpu(image, expected, planes=PLANES, share=0.01):
 
 
 def assert_devices_agree(subject, camera, **options):
-    """Compare all channels of both devices; return the picture of the CPU."""
+    """Compare all channels of both devices, and return the picture of the CPU."""
     image, expected = (
         v3dg.render(subject, camera, channels=CHANNELS, device=device, **options)
         for device in ("cuda", "cpu")
@@ -165,7 +169,7 @@ def test_colours_do_not_change_with_channels(scene, tinted_scene, options):
 
 
 def test_long_lists_keep_their_order():
-    """Without channels, long lists of tiles are blended in parts by several blocks."""
+    """Without channels, long lists of tiles are blended in parts, by several blocks."""
     rng = np.random.default_rng(1)
     bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 400, size=0.2), 64)
     scene = Scene()
@@ -243,7 +247,7 @@ def test_pools_given_cuts_and_quantized_gaussians_have_channels(scene):
     expected = v3dg.render(scene, camera, channels=CHANNELS, device="cuda", memory=None)
     pooled = v3dg.render(scene, camera, channels=CHANNELS, device="cuda", memory=1 << 26)
     assert_same(pooled, expected, ("color", "instance", "label", "weight", "median_depth"))
-    # Normals are found from covariances there.
+    # With a pool, normals are computed from covariances.
     np.testing.assert_allclose(host(pooled.normal), host(expected.normal), atol=2e-3)
     cut = v3dg.select(scene, camera, device="cuda")
     image = v3dg.render(scene, camera, cut=cut, channels=CHANNELS, device="cuda")
@@ -458,7 +462,7 @@ def test_meshes_on_the_device_are_those_on_the_host(scene):
     assert_same(drawn, expected, exact)
     np.testing.assert_allclose(host(drawn.normal), host(expected.normal), atol=1e-5)
     assert 3 in host(expected.label)
-    # Where the numbers are no mesh, there is none.
+    # Where the numbers are not valid for a mesh, there is none.
     wrong = on_cuda(mesh)
     wrong.depth[0] = -1.0
     wrong.depth[1] = torch.nan

@@ -1,4 +1,4 @@
-"""Two eyes share one cut. It is exact for the nearer eye, and leaves out what neither
+"""Two eyes share one cut. It is exact for the nearer eye, and omits what neither eye
 can see."""
 
 import dataclasses
@@ -58,8 +58,8 @@ def options_of(k, scene, stereo):
 
 
 def test_the_cut_is_that_of_the_nearer_eye(scene):
-    """The cut is refined if one of the eyes alone refines it; the cut of each eye is at
-    least as coarse on every path."""
+    """The cut is refined wherever it is refined for one of the eyes alone. On every
+    path, the cut of each eye is at least as coarse."""
     groups_of = [bundle.clusters for bundle in scene.bundles]
     for stereo in stereo_cameras():
         if stereo.left.fx != stereo.right.fx:

@@ -60,8 +60,8 @@ def test_window_has_the_bits_of_the_whole_picture():
 
 
 def test_picture_of_more_gaussians_than_memory_takes_at_once_is_the_same():
-    """The picture is drawn in bands; each half has few enough gaussians to be drawn at
-    once."""
+    """The picture is drawn in bands, but each half has few enough gaussians to be drawn
+    at once."""
     rng = np.random.default_rng(1)
     middle = CAMERA.height // 2
     halves = [(0, 0, CAMERA.width, middle), (0, middle, CAMERA.width, CAMERA.height)]

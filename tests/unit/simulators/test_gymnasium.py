@@ -1,4 +1,4 @@
-"""Vector environments of Gymnasium: their observations, episodes and seeds, and a
+"""Tests vector environments of Gymnasium: their observations, episodes and seeds, and a
 policy that learns from pixels."""
 
 import sys
@@ -29,7 +29,10 @@ def donut():
 
 
 class Approach(PictureVectorEnv):
-    """Cameras approach donuts; environment i ends in a last state after 3 + i steps."""
+    """Cameras approach donuts.
+
+    Environment i reaches its final state after 3 + i steps.
+    """
 
     def __init__(self, donut, *, num_envs=3, max_steps=5, device="cpu"):
         scene = v3dg.Scene()
@@ -91,11 +94,11 @@ def test_episodes_end_and_start_again_in_the_next_step(donut):
     terminations = torch.stack([row[2] for row in results[1:]])
     truncations = torch.stack([row[3] for row in results[1:]])
     rewards = torch.stack([row[1] for row in results[1:]])
-    # Environment 0 ends after 3 steps, starts in step 4, and ends after 3 more.
+    # Environment 0 ends after 3 steps, starts again in step 4, and ends after 3 more.
     assert terminations[:, 0].tolist() == [False, False, True, False, False, False, True, False]
     assert rewards[:, 0].tolist() == [1, 1, 1, 0, 1, 1, 1, 0]
     assert not truncations[:, 0].any()
-    # Environment 2 would end after 5 steps, which is also the limit.
+    # Environment 2 would end after 5 steps, which is also the maximum.
     assert terminations[:, 2].nonzero()[:, 0].tolist() == [4]
     assert not truncations[:, 2].any()
 
@@ -147,7 +150,7 @@ def test_wrong_arguments_are_errors(donut):
 def test_observations_are_tensors_on_the_device(donut):
     env = Approach(donut, device="cuda")
     env.reset(seed=1)
-    # Generators of devices have other numbers.
+    # Generators on a device return other numbers than those on the CPU.
     cpu = Approach(donut, device="cpu")
     cpu.reset(seed=1)
     cpu.depth = env.depth.cpu()
@@ -161,8 +164,8 @@ def test_observations_are_tensors_on_the_device(donut):
 
 @pytest.mark.slow
 def test_policy_learns_from_pixels():
-    """Random actions have a return of -0.7 to 0.3, and policies of 4.1 to 4.4, with
-    three seeds. Without pictures, no policy can know the direction."""
+    """Random actions have a return of -0.7 to 0.3, and trained policies of 4.1 to 4.4,
+    with three seeds. Without pictures, no policy can find out the direction."""
     config = train_policy.Config(
         envs=64, size=16, gaussians=1000, updates=12, device="cpu", output=None
     )

@@ -1,5 +1,5 @@
-"""The renderer for Isaac Lab, driven by the classes that Isaac Lab itself uses for
-that: `RenderContext`, `CameraCfg`, `CameraData` and `ProxyArray`."""
+"""Tests the renderer for Isaac Lab with the classes through which Isaac Lab itself
+calls it: `RenderContext`, `CameraCfg`, `CameraData` and `ProxyArray`."""
 
 import math
 
@@ -112,7 +112,7 @@ def test_outputs_are_pictures_of_the_environments(path):
         image = v3dg.render(
             scene, camera, channels=channels, background=(0.2, 0.4, 0.6), device="cpu"
         )
-        # Poses are single precision here.
+        # Poses are in single precision here.
         np.testing.assert_allclose(outputs["rgb"][number] / 255, image.color.clip(0, 1), atol=3e-3)
         is_drawn = image.depth > 0
         for name in ("depth", "distance_to_image_plane"):

@@ -77,7 +77,10 @@ def data(model):
 
 @pytest.fixture(scope="module")
 def drawable(model):
-    """The model, if MuJoCo has a library and a context of OpenGL here."""
+    """Return the model.
+
+    Skip the test if MuJoCo has no library or context of OpenGL here.
+    """
     if not hasattr(mujoco, "GLContext"):
         pytest.skip("MuJoCo cannot draw here: it has no library for OpenGL")
     try:
@@ -129,7 +132,8 @@ def test_cameras_of_the_model_are_a_batch(model, data):
         camera = camera_of(model, other, name, width=WIDTH, height=HEIGHT)
         np.testing.assert_array_equal(batch.viewmats[3 + number], camera.viewmat)
         np.testing.assert_array_equal(batch.K[3 + number], camera.K)
-    assert not np.allclose(batch.viewmats[2], batch.viewmats[5])  # on a body that moved
+    # this camera is on a body that moved
+    assert not np.allclose(batch.viewmats[2], batch.viewmats[5])
     alone = cameras_of(model, data, ["lens"], width=WIDTH, height=HEIGHT)
     assert len(alone) == 1
     assert alone.environments is None
@@ -241,7 +245,7 @@ def test_orthographic_cameras_are_refused():
     model = mujoco.MjModel.from_xml_string(MODEL)
     column = "cam_projection"
     if not hasattr(model, column):
-        column = "cam_orthographic"  # in older versions
+        column = "cam_orthographic"  # the name in older versions
     getattr(model, column)[0] = 1
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

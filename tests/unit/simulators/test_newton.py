@@ -1,4 +1,4 @@
-"""A camera sensor for models of Newton: worlds, bodies, images, and Newton's own
+"""Tests a camera sensor for models of Newton: worlds, bodies, images, and Newton's own
 pictures of the same gaussians."""
 
 import numpy as np
@@ -22,7 +22,8 @@ from v3dg.simulators.newton import (  # noqa: E402
 SIZE = 48
 FOV = 0.8
 EYE = (0.0, -2.0, 0.5)
-# Looks along y: -z of the camera is y of the world, and its y is z.
+# A camera that looks along the world's y axis: its -z is the world's y, and its y is
+# the world's z.
 TURN = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
 CONFIG = v3dg.BuildConfig(steps=0)
 
@@ -94,7 +95,8 @@ def test_views_show_the_gaussians_of_their_world_where_the_bodies_are(gaussian):
         scene.add(bundle, place, turn, 0.3)
         expected = v3dg.render(scene, our_view(), device="cpu").color
         assert expected.max() > 0.3
-        # Poses are single precision here, which moves edges by a fraction of a pixel.
+        # Poses are in single precision here, which moves edges by a fraction of a
+        # pixel.
         np.testing.assert_allclose(pictures.color[number], expected, atol=2e-3)
 
 
@@ -143,7 +145,7 @@ def test_images_are_written_as_newton_does(gaussian):
     parts = color.numpy().view(np.uint8).reshape(1, SIZE, SIZE, 4)
     np.testing.assert_allclose(parts[..., :3] / 255, pictures.color.clip(0, 1), atol=0.5 / 255)
     np.testing.assert_allclose(parts[..., 3] / 255, pictures.alpha, atol=0.5 / 255)
-    # What is seen faces the eye, which looks along y.
+    # Visible surfaces face the eye, which looks along y.
     is_drawn = pictures.alpha[0] > 0.9
     assert (normal.numpy()[0][is_drawn][:, 1] < 0.3).mean() > 0.9
 
@@ -181,7 +183,7 @@ def test_wrong_arguments_are_errors(gaussian):
 
 @pytest.mark.slow
 def test_pictures_resemble_those_that_newton_traces():
-    """Newton evaluates gaussians on the ray, and draws only degree 0."""
+    """Newton evaluates gaussians on the ray, and only draws degree 0."""
     model = make_model(make_gaussian(0), num_worlds=1)
     state = model.state()
     camera = make_camera(model)
@@ -206,7 +208,7 @@ def test_pictures_resemble_those_that_newton_traces():
     traced = mesh_layer(color, traced_depth)
     is_both = (pictures.alpha[0] > 0.9) & (traced.depth[0] > 0)
     assert is_both.sum() > 100
-    # Newton shows only pixels in which less than a hundredth of the light passes.
+    # Newton only shows pixels in which the transmittance is less than a hundredth.
     is_clear = traced.depth[0] > 0
     assert (is_clear & (pictures.alpha[0] < 0.8)).sum() < 0.05 * is_clear.sum()
     assert np.median(np.abs(traced.depth[0] - forward.numpy()[0])[is_both]) < 0.05

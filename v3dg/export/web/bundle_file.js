@@ -1,42 +1,55 @@
-// Reads the tables of a bundle file (docs/format.md) and says where its pages are.
+// Reads the tables of a bundle file (docs/format.md), and computes where its pages are.
 
 import { UserError } from "./source.js";
 
 /** @typedef {import("./core.js").Core} Core */
 /** @typedef {import("./source.js").Source} Source */
-/** @typedef {Record<string, { dtype: string, shape: number[], data_offsets: number[] }>} Header */
 /**
- * @typedef {object} Tables See docs/format.md.
- * @property {BigInt64Array} offset C + 1.
- * @property {Int32Array} level C.
- * @property {Int32Array} ownGroup C.
- * @property {Int32Array} parentGroup C.
- * @property {Float32Array} box C * 6.
- * @property {Float32Array} filter C.
- * @property {Uint8Array} antialiased C.
- * @property {Float32Array} ball G * 4.
- * @property {Float32Array} weight G.
- * @property {Int32Array} groupParent G.
- * @property {Int32Array} groupLevel G.
- * @property {Float32Array} groupError G * 2.
- * @property {BigInt64Array} pageOffset P.
- * @property {Int32Array} firstCluster P.
- * @property {Uint8Array} pageHash P * 16.
+ * The header of a file, by the names of its entries.
+ *
+ * @typedef {Record<string, { dtype: string, shape: number[], data_offsets: number[] }>} Header
+ */
+/**
+ * The tables of a bundle, which docs/format.md explains. There are C clusters, G groups
+ * and P pages.
+ *
+ * @typedef {object} Tables
+ * @property {BigInt64Array} offset C + 1 numbers.
+ * @property {Int32Array} level C numbers.
+ * @property {Int32Array} ownGroup C numbers.
+ * @property {Int32Array} parentGroup C numbers.
+ * @property {Float32Array} box C * 6 numbers.
+ * @property {Float32Array} filter C numbers.
+ * @property {Uint8Array} antialiased C numbers.
+ * @property {Float32Array} ball G * 4 numbers.
+ * @property {Float32Array} weight G numbers.
+ * @property {Int32Array} groupParent G numbers.
+ * @property {Int32Array} groupLevel G numbers.
+ * @property {Float32Array} groupError G * 2 numbers.
+ * @property {BigInt64Array} pageOffset P numbers.
+ * @property {Int32Array} firstCluster P numbers.
+ * @property {Uint8Array} pageHash P * 16 bytes.
  */
 
 const MOST_HEADER_BYTES = 2 ** 20;
 const MOST_TABLE_BYTES = 2 ** 28;
-/** Bytes of the first request. Headers with the settings of a build are shorter. */
+/**
+ * Number of bytes in the first request. Most headers with the settings of a build are
+ * shorter.
+ */
 const FIRST_BYTES = 2 ** 14;
 const VERSIONS = ["2", "3"];
 const HASH_BYTES = 16;
 const HASH_PIECE_BYTES = 16384;
 const PAGE_ALIGNMENT = 16;
-/** Words of the ranges of a cluster, by degree. */
+/** Number of words in the ranges of a cluster, by SH degree. */
 export const WORDS_OF_RANGES = [10, 12, 13, 15];
 export const WORDS_OF_RECORD = 4;
 
-/** Name in the file, type, rows and width of each table, in the order of the file. */
+/**
+ * The name, the type, the number of rows and the width of each table, in the order of
+ * the file.
+ */
 const SCHEMA = /** @type {const} */ ([
   ["offset", "clusters.offset", "I64", "C+1", 1],
   ["pageOffset", "pages.offset", "I64", "P", 1],
@@ -56,13 +69,17 @@ const SCHEMA = /** @type {const} */ ([
 ]);
 const TYPES = { I64: BigInt64Array, I32: Int32Array, F32: Float32Array, U8: Uint8Array };
 
-/** @param {Uint8Array} bytes */
+/**
+ * Decode text in UTF-8.
+ *
+ * @param {Uint8Array} bytes
+ */
 function textOf(bytes) {
   return new TextDecoder("utf-8", { fatal: true }).decode(bytes);
 }
 
 /**
- * Return the bytes of a page.
+ * Return the number of bytes of a page.
  *
  * @param {number} gaussians
  * @param {number} clusters
@@ -79,7 +96,7 @@ export class BundleFile {
    * Read and check the tables.
    *
    * @param {Source} source
-   * @param {() => Promise<Core>} newCore Makes a core, which a failed check ends.
+   * @param {() => Promise<Core>} newCore Makes a core. If a check fails, the core ends.
    */
   static async open(source, newCore) {
     const { head, header, degree, version } = await readHeader(source);
@@ -89,9 +106,11 @@ export class BundleFile {
   }
 
   /**
+   * Store the values of the header.
+   *
    * @param {Source} source
-   * @param {number} degree Of the spherical harmonics.
-   * @param {number} dataStart First byte of the pages in the file.
+   * @param {number} degree The degree of the spherical harmonics.
+   * @param {number} dataStart The first byte of the pages in the file.
    */
   constructor(source, degree, dataStart) {
     this.source = source;
@@ -99,11 +118,13 @@ export class BundleFile {
     this.dataStart = dataStart;
     /** @type {Tables} */
     this.tables = null;
-    /** Gaussians before each cluster, C + 1. @type {Float64Array} */
+    /** Number of gaussians before each cluster, C + 1. */
     this.rows = null;
-    /** The coarsest page. @type {Uint8Array} */
+    /** The bytes of the coarsest page. */
     this.root = null;
-    /** First byte of each page, from `dataStart`, and the end, P + 1. @type {Float64Array} */
+    /**
+     * First byte of each page, relative to `dataStart`, then the end: P + 1 numbers.
+     */
     this.pageStart = null;
   }
 
@@ -111,32 +132,45 @@ export class BundleFile {
     return this.tables.firstCluster.length;
   }
 
-  /** Bytes of the largest page. */
+  /** Number of bytes of the largest page. */
   get mostPageBytes() {
     let most = 0;
     for (let page = 0; page < this.numPages; page += 1) most = Math.max(most, this.bytesOf(page));
     return most;
   }
 
-  /** @param {number} page */
+  /**
+   * Return the number of bytes of a page.
+   *
+   * @param {number} page
+   */
   bytesOf(page) {
     return this.pageStart[page + 1] - this.pageStart[page];
   }
 
-  /** @param {number} page */
+  /**
+   * Return the index after the last cluster of a page.
+   *
+   * @param {number} page
+   */
   endCluster(page) {
     const { firstCluster, level } = this.tables;
     return page + 1 < this.numPages ? firstCluster[page + 1] : level.length;
   }
 
-  /** @param {number} cluster */
+  /**
+   * Return the page that contains a cluster.
+   *
+   * @param {number} cluster
+   */
   pageOf(cluster) {
     const group = this.tables.parentGroup[cluster];
     return group < 0 ? this.numPages - 1 : group;
   }
 
   /**
-   * Return the page of which the clusters of a group's page were made; -1 for the last page.
+   * Return the page above a page. It contains the clusters that replace those of the page.
+   * The result is -1 for the last page.
    *
    * @param {number} page
    */
@@ -146,16 +180,22 @@ export class BundleFile {
     return groupParent[page] < 0 ? groupParent.length : groupParent[page];
   }
 
-  /** @param {string} text */
+  /**
+   * Return an error about this file.
+   *
+   * @param {string} text
+   */
   problem(text) {
     return new UserError(`${this.source.name}: ${text}`);
   }
 
   /**
+   * Read the tables after the pages, and check their hash.
+   *
    * @param {Uint8Array} head The bytes before the pages.
-   * @param {Header} header What they say.
+   * @param {Header} header The parsed header.
    * @param {string} version
-   * @param {() => Promise<Core>} newCore
+   * @param {() => Promise<Core>} newCore Makes a core. If a check fails, the core ends.
    */
   async readTables(head, header, version, newCore) {
     const { source, dataStart } = this;
@@ -192,7 +232,7 @@ export class BundleFile {
   }
 
   /**
-   * Check that pages follow one another as their sizes say.
+   * Check that pages follow one another without gaps, given their sizes.
    *
    * @param {number} pagesBytes
    */
@@ -217,7 +257,7 @@ export class BundleFile {
   }
 
   /**
-   * Read neighbouring pages. Returns the bytes of each.
+   * Read neighbouring pages, and return the bytes of each.
    *
    * @param {number} first
    * @param {number} end
@@ -265,7 +305,11 @@ export class BundleFile {
   }
 }
 
-/** @param {Source} source */
+/**
+ * Read the header of a file.
+ *
+ * @param {Source} source
+ */
 async function readHeader(source) {
   let bytes = await source.read(0, FIRST_BYTES);
   const refuse = (/** @type {string} */ expected) =>
@@ -291,13 +335,17 @@ async function readHeader(source) {
   return { head, header, version, degree: Number(degree) };
 }
 
-/** @param {unknown} number */
+/**
+ * Return whether a value is an integer of at least 0.
+ *
+ * @param {unknown} number
+ */
 function isCount(number) {
   return Number.isSafeInteger(number) && /** @type {number} */ (number) >= 0;
 }
 
 /**
- * Return the numbers of clusters, groups and pages; null if the header has none.
+ * Return the numbers of clusters, groups and pages, or null if the header lacks them.
  *
  * @param {Header} header
  */
@@ -309,7 +357,8 @@ function countsOf(header) {
 }
 
 /**
- * Return where each table must be, from the start of the pages; null if the header differs.
+ * Return the position of each table, relative to the start of the pages. Return null if
+ * the header has other positions.
  *
  * @param {Header} header
  * @param {number} pagesBytes
@@ -332,7 +381,7 @@ function placesOf(header, pagesBytes) {
 }
 
 /**
- * Whether the header and the tables match the hash at their end.
+ * Return whether the header and the tables match the hash at their end.
  *
  * @param {Core} core
  * @param {string} version

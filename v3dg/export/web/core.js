@@ -1,13 +1,14 @@
-// The interface of core.cpp for JavaScript: tables and views go into the module's
-// memory, cuts and rows come out as arrays. Works in pages, workers and node.
+// The interface of core.cpp for JavaScript. Tables and views are copied to the module's
+// memory, and cuts and rows are returned as arrays. It works in web pages, in workers
+// and in node.
 
 const WORDS_OF_BUNDLE = 14;
 const BYTES_OF_VIEW = 8 * 29 + 4 * 8;
 const BYTES_OF_CUT = 32;
 const NO_POINTER = 0;
 
-// What the module may ask of its host. It has no files, so all calls fail, except for
-// those that end the module.
+// The functions that the module may call. It has no files, so all of them fail, except
+// for those that end the module.
 const HOST = {
   fd_write: () => 8,
   fd_close: () => 8,
@@ -18,11 +19,13 @@ const HOST = {
   },
 };
 
-/** A loaded module: its memory, and the calls of core.cpp. */
+/** A loaded module: its memory, and the functions of core.cpp. */
 export class Core {
   /**
-   * @param {BufferSource | WebAssembly.Module} code The module, as csrc/wasm/build.py makes
-   *   it, or what it was compiled to.
+   * Load the module.
+   *
+   * @param {BufferSource | WebAssembly.Module} code The module that csrc/wasm/build.py
+   *   has made, as bytes or compiled.
    */
   static async load(code) {
     const made = await WebAssembly.instantiate(code, { wasi_snapshot_preview1: HOST });
@@ -44,7 +47,7 @@ export class Core {
     return place;
   }
 
-  /** Copy an array of numbers into the module; null becomes the null pointer. */
+  /** Copy an array of numbers to the module. null becomes the null pointer. */
   copy(array) {
     if (array === null || array === undefined) return NO_POINTER;
     const place = this.allocate(Math.max(array.byteLength, 8));
@@ -57,17 +60,17 @@ export class Core {
     new Uint8Array(this.calls.memory.buffer, place, array.byteLength).set(bytes);
   }
 
-  /** Return a copy of `count` numbers at a place in the module. */
+  /** Return a copy of `count` numbers at an address in the module. */
   read(Type, place, count) {
     return new Type(this.calls.memory.buffer, place, count).slice();
   }
 
-  /** A view of the module's memory. It is valid until the module allocates. */
+  /** A view of the module's memory. It is valid until the module allocates memory. */
   view() {
     return new DataView(this.calls.memory.buffer);
   }
 
-  /** Verify a page: return its hash, 16 bytes. */
+  /** Return the hash of a page, which has 16 bytes. */
   hash(bytes) {
     const message = this.copy(bytes);
     this.calls.v3dg_hash(message, bytes.byteLength, this.result);
@@ -77,9 +80,10 @@ export class Core {
   }
 
   /**
-   * Check the tables of a file. If they are invalid, the module ends by a trap, and
+   * Check the tables of a file. If they are invalid, the module ends with a trap, and
    * must be loaded again.
-   * @param {object} tables See bundle_file.js.
+   *
+   * @param {object} tables The tables, as in bundle_file.js.
    */
   checkTables(tables) {
     const places = [
@@ -104,10 +108,11 @@ export class Core {
   }
 
   /**
-   * Whether all gaussians of a coded page are finite.
-   * @param {BigInt64Array} offset First row of each cluster, and the end.
-   * @param {Uint8Array} bytes The page.
-   * @param {number} degree Degree of the spherical harmonics.
+   * Return whether all gaussians of a coded page are finite.
+   *
+   * @param {BigInt64Array} offset The first row of each cluster, then the end.
+   * @param {Uint8Array} bytes The bytes of the page.
+   * @param {number} degree The degree of the spherical harmonics.
    */
   isValidPage(offset, bytes, degree) {
     const relative = BigInt64Array.from(offset, (row) => row - offset[0]);
@@ -119,10 +124,11 @@ export class Core {
   }
 
   /**
-   * Decode a coded page to its rows.
-   * @param {BigInt64Array} offset First row of each cluster, and the end.
-   * @param {Uint8Array} bytes The page.
-   * @param {number} degree Degree of the spherical harmonics.
+   * Decode a coded page to rows.
+   *
+   * @param {BigInt64Array} offset The first row of each cluster, then the end.
+   * @param {Uint8Array} bytes The bytes of the page.
+   * @param {number} degree The degree of the spherical harmonics.
    */
   decodePage(offset, bytes, degree) {
     const count = Number(offset[offset.length - 1] - offset[0]);
@@ -142,7 +148,7 @@ export class Core {
   }
 }
 
-/** The tables of a bundle, in the module. */
+/** The tables of a bundle, in the memory of the module. */
 export class Bundle {
   /**
    * @param {Core} core
@@ -176,7 +182,7 @@ export class Bundle {
     core.calls.v3dg_free(argument);
   }
 
-  /** Replace the page table. The arrays must have the lengths of those before. */
+  /** Replace the page table. The arrays must have the same lengths as before. */
   setPages(shift, begins) {
     this.core.write(this.places[9], shift);
     if (begins) this.core.write(this.places[10], begins);
@@ -197,7 +203,11 @@ export class Bundle {
 
 /** Bundles and their instances. */
 export class Scene {
-  /** @param {Bundle[]} bundles They must outlive the scene. */
+  /**
+   * Store the arguments.
+   *
+   * @param {Bundle[]} bundles The bundles, which must outlive the scene.
+   */
   constructor(core, bundles) {
     this.core = core;
     this.places = [];

@@ -1,4 +1,5 @@
-// Lays a cut out for project.wgsl: where the codes of each cluster are in the pool.
+// Computes the layout of a cut for project.wgsl: where the codes of each cluster are in
+// the pool.
 
 import { WORDS_OF_RANGES, WORDS_OF_RECORD } from "./bundle_file.js";
 import { GAUSSIANS_OF_WORKGROUP, WORDS_OF_PAIR } from "./renderer.js";
@@ -7,10 +8,13 @@ import { GAUSSIANS_OF_WORKGROUP, WORDS_OF_PAIR } from "./renderer.js";
 /** @typedef {import("./placement.js").Instances} Instances */
 /** @typedef {import("./renderer.js").Cut} Cut */
 /**
+ * The clusters of a cut.
+ *
  * @typedef {object} Selection
  * @property {Int32Array} instance
  * @property {Int32Array} cluster
- * @property {Float32Array} weight Null if all are 1.
+ * @property {Float32Array} weight The weight of each cluster, or null if all weights
+ *   are 1.
  */
 
 const ANTIALIASED = 1;
@@ -20,6 +24,8 @@ const DEGREE_SHIFT = 4;
 const FADE_FILTER = 0.05;
 
 /**
+ * Return the filter of a cluster, and whether it is antialiased.
+ *
  * @param {BundleFile} bundle
  * @param {number} cluster
  * @param {boolean} fades
@@ -34,11 +40,12 @@ function lookOf({ tables, degree }, cluster, fades) {
 }
 
 /**
- * Return a selection in the layout of project.wgsl.
+ * Return a selection in the layout that project.wgsl reads.
  *
- * @param {Selection} selection All of its pages are in the pool.
+ * @param {Selection} selection The cut. All of its pages must be in the pool.
  * @param {BundleFile[]} bundles
- * @param {Float64Array[]} places First byte of each page in the pool, for each bundle.
+ * @param {Float64Array[]} places For each bundle, the first byte of each page in the
+ *   pool.
  * @param {Instances} instances
  * @returns {Cut}
  */

@@ -1,4 +1,4 @@
-// The page of an exported scene: its controls, and how the camera moves.
+// The web page of an exported scene: its controls, and the movements of the camera.
 
 import { AXES, Camera, isMode } from "./camera.js";
 import * as M from "./math.js";
@@ -31,18 +31,30 @@ const PUSHES = new Map([
 const element = (/** @type {string} */ id) => document.getElementById(id);
 const canvas = /** @type {HTMLCanvasElement} */ (element("canvas"));
 
-/** @param {string} text A line of plain text; empty to hide it. */
+/**
+ * Show a line of text.
+ *
+ * @param {string} text Plain text. An empty text hides the line.
+ */
 function say(text) {
   element("notice").textContent = text;
 }
 
-/** @param {number} count */
+/**
+ * Return a number as short text, such as 1.2 M.
+ *
+ * @param {number} count
+ */
 function shortened(count) {
   if (count >= 1e6) return `${(count / 1e6).toFixed(1)} M`;
   return count >= 1e4 ? `${Math.round(count / 1e3)} k` : String(count);
 }
 
-/** @param {number} bytes */
+/**
+ * Return a number of bytes as text in megabytes.
+ *
+ * @param {number} bytes
+ */
 function megabytes(bytes) {
   return `${(bytes / 2 ** 20).toFixed(1)} MiB`;
 }
@@ -51,7 +63,7 @@ class Page {
   camera = new Camera();
   /** Codes of keys that are held. @type {Set<string>} */
   keys = new Set();
-  /** Positions of pressed pointers, by their id. @type {Map<number, number[]>} */
+  /** Positions of the pointers that are pressed, by their id. */
   pointers = new Map();
   near = 0.01;
   isMoving = false;
@@ -100,7 +112,7 @@ class Page {
   }
 
   /**
-   * Let a slider set a setting, on a logarithmic scale.
+   * Connect a slider with a logarithmic scale to a setting.
    *
    * @param {"budget" | "tolerance"} name
    * @param {(value: number) => string} text
@@ -118,16 +130,20 @@ class Page {
     show();
   }
 
-  /** @param {NamedCamera} view */
+  /**
+   * Move the camera to a view.
+   *
+   * @param {NamedCamera} view
+   */
   lookThrough({ viewmat, k, width, height, near }) {
     const rows = [0, 1, 2].map((row) => Array.from(viewmat).slice(4 * row, 4 * row + 3));
     const wxyz = M.unit(M.fromAxes(rows[0], rows[1], rows[2]));
     const position = eyeOf(viewmat);
     this.near = near;
-    // put() moves the focus ahead of the camera, at this distance.
+    // put() places the focus in front of the camera, at its current distance.
     this.camera.position = position;
     this.camera.focus = this.viewer.ball.slice(0, 3);
-    // All of the view is visible in windows of any shape.
+    // The whole view must be visible in windows of any shape.
     const slopeX = (width / (2 * k[0])) * (canvas.clientHeight / canvas.clientWidth);
     const slope = Math.max(height / (2 * k[4]), slopeX);
     this.camera.put({ wxyz, position, fov_y: 2 * Math.atan(slope) });
@@ -153,7 +169,11 @@ class Page {
     new ResizeObserver(() => this.redraw()).observe(canvas);
   }
 
-  /** @param {KeyboardEvent} event */
+  /**
+   * Handle a button that is pressed, or a finger that touches.
+   *
+   * @param {KeyboardEvent} event
+   */
   press(event) {
     const isTyping = event.target instanceof HTMLInputElement;
     if (isTyping || event.ctrlKey || event.metaKey || !PUSHES.has(event.code)) return;
@@ -162,7 +182,11 @@ class Page {
     this.startMoving();
   }
 
-  /** @param {PointerEvent} event */
+  /**
+   * Handle a pointer that moves.
+   *
+   * @param {PointerEvent} event
+   */
   movePointer(event) {
     const before = this.pointers.get(event.pointerId);
     if (before === undefined) return;
@@ -177,6 +201,8 @@ class Page {
   }
 
   /**
+   * Turn the camera by a movement of the pointer, px.
+   *
    * @param {number} dx
    * @param {number} dy
    */
@@ -188,6 +214,8 @@ class Page {
   }
 
   /**
+   * Move the camera sideways by a movement of the pointer, px.
+   *
    * @param {number} dx
    * @param {number} dy
    */
@@ -199,7 +227,7 @@ class Page {
   }
 
   /**
-   * Two fingers: spreading them moves the camera closer.
+   * Handle two fingers. Spreading them moves the camera closer.
    *
    * @param {number[]} before
    * @param {number[]} place
@@ -212,7 +240,11 @@ class Page {
     this.pan(dx / 2, dy / 2);
   }
 
-  /** @param {WheelEvent} event */
+  /**
+   * Handle the wheel of the mouse.
+   *
+   * @param {WheelEvent} event
+   */
   wheel(event) {
     event.preventDefault();
     const px = M.clamp(event.deltaY, -MOST_WHEEL_PX, MOST_WHEEL_PX);
@@ -228,7 +260,11 @@ class Page {
     requestAnimationFrame((time) => this.step(time));
   }
 
-  /** @param {number} time */
+  /**
+   * Advance the movements by keys.
+   *
+   * @param {number} time The time of the frame, ms.
+   */
   step(time) {
     const seconds = Math.min((time - this.lastTime) / 1000, MOST_STEP_SECONDS);
     this.lastTime = time;
@@ -240,7 +276,7 @@ class Page {
     if (this.isMoving) requestAnimationFrame((next) => this.step(next));
   }
 
-  /** Draw what the camera sees. */
+  /** Draw the view of the camera. */
   redraw() {
     let ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO);
     while (!isDrawable(canvas.clientWidth * ratio, canvas.clientHeight * ratio)) ratio /= 2;
@@ -271,7 +307,10 @@ class Page {
   }
 }
 
-/** Return the settings in the page's address; what is no positive number is ignored. */
+/**
+ * Return the settings in the address of the web page. Values that are not positive
+ * numbers are ignored.
+ */
 function settingsOfAddress() {
   const query = new URLSearchParams(location.search);
   const names = ["budget", "tolerance"].filter((name) => Number(query.get(name)) > 0);

@@ -1,7 +1,8 @@
-// Which pages of all bundles are resident, in memory of a fixed size: the coarsest page
-// of each bundle, then slots of equal size. A page becomes resident after the page above
-// it, and leaves before that one, so the pool is closed towards the root. The page that
-// was not needed for longest leaves first.
+// Decides which pages of all bundles are resident in memory of a fixed size. The memory
+// begins with the coarsest page of each bundle; the rest is divided into slots of equal
+// size. A page becomes resident after the page above it, and is evicted before that
+// one. So with each page, all pages above it are resident. The least recently used page
+// is evicted first.
 
 import { UserError } from "./source.js";
 
@@ -10,11 +11,11 @@ import { UserError } from "./source.js";
 
 const ABSENT_PAGE = -(2n ** 63n);
 const NEVER_BEGINS = 2 ** 31 - 1;
-/** A page fades in during this many frames (csrc/residency/page_table.h). */
+/** Number of frames in which a page fades in (csrc/residency/page_table.h). */
 export const ARRIVAL_FRAMES = 8;
 /** Pages with at least this priority are requested (csrc/select/page_need.h). */
 const LEAST_PRIORITY = 0.5;
-/** The priority of a page is this many times that of each page below it. */
+/** The priority of a page is at least this many times that of each page below it. */
 const ABOVE = 2;
 const MOST_PRIORITY = 2 ** 30;
 const NO_SLOT = -1;
@@ -25,7 +26,7 @@ class Pages {
   constructor(file) {
     const { numPages } = file;
     this.file = file;
-    /** For each page, see PageTable in csrc/residency/page_table.h. */
+    /** The row offset of each page, as in PageTable in csrc/residency/page_table.h. */
     this.shift = new BigInt64Array(numPages).fill(ABSENT_PAGE);
     this.begins = new Int32Array(numPages).fill(NEVER_BEGINS);
     /** First byte of each page in the pool. */
@@ -36,15 +37,21 @@ class Pages {
     this.hasChanged = true;
   }
 
-  /** @param {number} page */
+  /**
+   * Return whether a page is resident.
+   *
+   * @param {number} page
+   */
   isResident(page) {
     return this.shift[page] !== ABSENT_PAGE;
   }
 
   /**
+   * Make a page resident.
+   *
    * @param {number} page
-   * @param {number} place
-   * @param {number} frame
+   * @param {number} place The first byte of the page in the pool.
+   * @param {number} frame The frame after which it fades in.
    */
   put(page, place, frame) {
     this.shift[page] = 0n;
@@ -55,7 +62,11 @@ class Pages {
     if (above >= 0) this.numBelow[above] += 1;
   }
 
-  /** @param {number} page */
+  /**
+   * Remove a page.
+   *
+   * @param {number} page
+   */
   remove(page) {
     this.shift[page] = ABSENT_PAGE;
     this.begins[page] = NEVER_BEGINS;
@@ -68,8 +79,10 @@ class Pages {
 
 export class PagePool {
   /**
+   * Store the arguments.
+   *
    * @param {BundleFile[]} files
-   * @param {number} bytes Size of the pool.
+   * @param {number} bytes The size of the pool.
    */
   constructor(files, bytes) {
     this.pages = files.map((file) => new Pages(file));
@@ -97,7 +110,7 @@ export class PagePool {
     this.lastArrival = -ARRIVAL_FRAMES;
   }
 
-  /** Bytes of the pool that pages may use. */
+  /** Number of bytes of the pool that pages may use. */
   get bytes() {
     return this.firstSlot + this.slotBytes * this.slots.length;
   }
@@ -106,13 +119,15 @@ export class PagePool {
     return this.slots.length - this.freeSlots.length;
   }
 
-  /** Places of the pages of each bundle, for layOut(). */
+  /**
+   * The first byte of each page in the pool, for each bundle, as input for layOut().
+   */
   get places() {
     return this.pages.map(({ places }) => places);
   }
 
   /**
-   * Make the coarsest page of a bundle resident. Returns its place.
+   * Make the coarsest page of a bundle resident. Returns its first byte in the pool.
    *
    * @param {number} bundle
    */
@@ -123,11 +138,11 @@ export class PagePool {
   }
 
   /**
-   * Store which pages of a bundle the cut of a frame needs. Returns the absent pages. The
-   * priority of a page is higher than those of the pages below it.
+   * Store which pages of a bundle the cut of a frame needs. Returns the absent pages. A
+   * page has a higher priority than the pages below it.
    *
    * @param {number} bundle
-   * @param {Float32Array} needs Priority of each page; 0 if it is not needed.
+   * @param {Float32Array} needs The priority of each page, or 0 if it is not needed.
    * @param {number} frame
    * @returns {Wanted[]}
    */
@@ -151,7 +166,8 @@ export class PagePool {
   }
 
   /**
-   * Whether a page may become resident: it is absent, and the page above is resident.
+   * Return whether a page may become resident. It must be absent, and the page above it
+   * must be resident.
    *
    * @param {number} bundle
    * @param {number} page
@@ -162,8 +178,8 @@ export class PagePool {
   }
 
   /**
-   * Make a page resident. Returns its place, or -1 if all slots have pages that the last
-   * cut needed.
+   * Make a page resident. Returns its first byte in the pool, or -1 if the last cut
+   * needed the pages of all slots.
    *
    * @param {number} bundle
    * @param {number} page
@@ -181,10 +197,10 @@ export class PagePool {
   }
 
   /**
-   * Remove a page that the last cut did not need. Returns its slot; NO_SLOT if there is
-   * none.
+   * Remove a page that the last cut did not need. Returns its slot, or NO_SLOT if there
+   * is none.
    *
-   * @param {number} frame Of the last cut.
+   * @param {number} frame The frame of the last cut.
    */
   evict(frame) {
     let oldest = NO_SLOT;

@@ -1,27 +1,37 @@
-// Where instances stand in front of a camera, in the layout of project.wgsl. Computed in
-// double precision and then rounded, as csrc/math/similarity.h and view.h do.
+// Computes how instances are placed in front of a camera, in the layout of
+// project.wgsl. As in csrc/math/similarity.h and view.h, values are computed in double
+// precision, and then rounded.
 
 /**
- * @typedef {object} Pinhole A camera with the OpenCV convention; matrices are row major.
- * @property {ArrayLike<number>} viewmat World to camera, 16 numbers.
- * @property {ArrayLike<number>} k Focal lengths and principal point, px, 9 numbers.
- * @property {number} near Depth before which no mean may lie, in world units.
+ * A camera in the OpenCV convention. Matrices are row-major.
+ *
+ * @typedef {object} Pinhole
+ * @property {ArrayLike<number>} viewmat The transform from world to camera, 16 numbers.
+ * @property {ArrayLike<number>} k Focal lengths and principal point in px, 9 numbers.
+ * @property {number} near Gaussians whose mean has a smaller depth, in world units, are
+ *   not drawn.
  * @property {number} width
  * @property {number} height
  */
 /**
+ * The columns of I instances.
+ *
  * @typedef {object} Instances
- * @property {Int32Array} bundle Bundle of each of I instances.
- * @property {Float64Array} positions I * 3.
- * @property {Float64Array} quaternions I * 4, w x y z.
- * @property {Float64Array} scales I.
- * @property {Float32Array} importance I.
- * @property {Float32Array} factors I * 4: red, green, blue, opacity; null if all are 1.
+ * @property {Int32Array} bundle The index of the bundle of each instance.
+ * @property {Float64Array} positions I * 3 numbers.
+ * @property {Float64Array} quaternions I * 4 numbers, w x y z.
+ * @property {Float64Array} scales I numbers.
+ * @property {Float32Array} importance I numbers.
+ * @property {Float32Array} factors I * 4 numbers (red, green, blue, opacity), or null
+ *   if all are 1.
  */
 
 export const FLOATS_OF_PLACEMENT = 24;
 export const FLOATS_OF_CAMERA = 16;
-/** Slopes are clamped this far outside of the picture, in halves of the field of view. */
+/**
+ * Slopes are clamped at this distance outside the picture, in units of half the field
+ * of view.
+ */
 const FOV_MARGIN = 0.3;
 
 /**
@@ -49,7 +59,7 @@ export function eyeOf(viewmat) {
 }
 
 /**
- * Return the row-major rotation matrix of a quaternion of any length but zero.
+ * Return the row-major rotation matrix of a quaternion of any nonzero length.
  *
  * @param {number} w
  * @param {number} x
@@ -75,10 +85,10 @@ export function rotationOf(w, x, y, z) {
  * Write the placement of one instance.
  *
  * @param {ArrayLike<number>} viewmat
- * @param {number[]} eye Position of the camera in the world.
+ * @param {number[]} eye The position of the camera in the world.
  * @param {Instances} instances
- * @param {number} index Of the instance.
- * @param {Float32Array} out FLOATS_OF_PLACEMENT numbers.
+ * @param {number} index The index of the instance.
+ * @param {Float32Array} out Receives FLOATS_OF_PLACEMENT numbers.
  */
 function place(viewmat, eye, instances, index, out) {
   const { positions, quaternions, scales, factors } = instances;
@@ -130,7 +140,7 @@ export function placementsOf(camera, instances, indices) {
  * Return the camera in the layout of shared.wgsl.
  *
  * @param {Pinhole} camera
- * @param {number} count Gaussians of the cut.
+ * @param {number} count The number of gaussians in the cut.
  * @param {number[]} background Red, green and blue, 0 to 1.
  * @param {number} minTransmittance Behind which pixels stop.
  */

@@ -5,14 +5,24 @@ import { UserError, nameOf } from "./source.js";
 
 /** @typedef {import("./placement.js").Instances} Instances */
 /** @typedef {import("./placement.js").Pinhole} Pinhole */
-/** @typedef {Pinhole & { name: string }} NamedCamera */
-/** @typedef {"x" | "y" | "z" | "-x" | "-y" | "-z"} Axis */
 /**
+ * A camera with a name.
+ *
+ * @typedef {Pinhole & { name: string }} NamedCamera
+ */
+/**
+ * An axis of the world.
+ *
+ * @typedef {"x" | "y" | "z" | "-x" | "-y" | "-z"} Axis
+ */
+/**
+ * The content of a scene file.
+ *
  * @typedef {object} SceneFile
- * @property {string[]} urls Of the bundles.
+ * @property {string[]} urls The URLs of the bundles.
  * @property {Instances} instances
  * @property {NamedCamera[]} cameras
- * @property {Axis} up The axis that points up; null if unknown.
+ * @property {Axis} up The axis that points up, or null if it is unknown.
  */
 
 const AXES = new Set(["x", "y", "z", "-x", "-y", "-z"]);
@@ -21,15 +31,21 @@ const MOST_INSTANCES = 10_000_000;
 const IDENTITY = [1, 0, 0, 0];
 const WHITE = [1, 1, 1];
 
-/** Refuses wrong values with the place in the file. */
+/** Rejects wrong values with an error that names their place in the file. */
 class Reader {
-  /** @param {string} name Of the file. */
+  /**
+   * Store the arguments.
+   *
+   * @param {string} name The name of the file.
+   */
   constructor(name) {
     this.name = name;
   }
 
   /**
-   * @param {string} place
+   * Throw an error about a value.
+   *
+   * @param {string} place The place of the value in the file.
    * @param {string} expected
    * @returns {never}
    */
@@ -38,9 +54,11 @@ class Reader {
   }
 
   /**
+   * Return a list of finite numbers.
+   *
    * @param {unknown} value
    * @param {string} place
-   * @param {number} count
+   * @param {number} count The required number of them.
    */
   numbers(value, place, count) {
     const flat = Array.isArray(value) ? value.flat() : [];
@@ -51,6 +69,8 @@ class Reader {
   }
 
   /**
+   * Return a positive number.
+   *
    * @param {unknown} value
    * @param {string} place
    */
@@ -62,6 +82,8 @@ class Reader {
   }
 
   /**
+   * Return a list.
+   *
    * @param {unknown} value
    * @param {string} place
    * @returns {unknown[]}
@@ -71,6 +93,8 @@ class Reader {
   }
 
   /**
+   * Return an object.
+   *
    * @param {unknown} value
    * @param {string} place
    * @returns {Record<string, unknown>}
@@ -84,7 +108,7 @@ class Reader {
 }
 
 /**
- * Return memory for instances, each at the origin.
+ * Return instances at the origin. The caller sets their values.
  *
  * @param {number} count
  * @returns {Instances}
@@ -113,9 +137,11 @@ function sceneOfBundle(url) {
 }
 
 /**
+ * Return the instances of a scene.
+ *
  * @param {Reader} reader
  * @param {unknown[]} list
- * @param {string[]} names Of the bundles.
+ * @param {string[]} names The names of the bundles.
  */
 function readInstances(reader, list, names) {
   if (list.length > MOST_INSTANCES) reader.refuse("instances", `at most ${MOST_INSTANCES}`);
@@ -139,6 +165,8 @@ function readInstances(reader, list, names) {
 }
 
 /**
+ * Return a camera of a scene.
+ *
  * @param {Reader} reader
  * @param {unknown} value
  * @param {number} index
@@ -157,7 +185,11 @@ function readCamera(reader, value, index) {
   };
 }
 
-/** @param {string} url */
+/**
+ * Load a JSON file.
+ *
+ * @param {string} url
+ */
 async function loadJson(url) {
   const name = nameOf(url);
   let response;
@@ -175,9 +207,9 @@ async function loadJson(url) {
 }
 
 /**
- * Read a scene, or take a bundle as a scene of one instance.
+ * Read a scene. A bundle is returned as a scene with one instance.
  *
- * @param {string} url Absolute; a bundle's name ends in .v3dg.
+ * @param {string} url An absolute URL. The name of a bundle ends in .v3dg.
  * @returns {Promise<SceneFile>}
  */
 export async function readScene(url) {

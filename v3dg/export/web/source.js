@@ -1,13 +1,13 @@
-// Reads parts of a file from a static server by HTTP ranges. If the server has no
-// ranges, the whole file is read once.
+// Reads parts of a file from a static server by HTTP ranges. If the server does not
+// support ranges, the whole file is read once.
 
-/** An error that is reported to the user, in one line. */
+/** An error that is shown to the user, in one line. */
 export class UserError extends Error {}
 
-/** A server or a network that does not answer. The read may be tried again. */
+/** The server or the network does not answer. Reading may be tried again. */
 export class Unreachable extends UserError {}
 
-/** Largest file that is read whole, bytes. */
+/** Maximum size, in bytes, of a file that is read as a whole. */
 const MOST_WHOLE_BYTES = 2 ** 29;
 
 /**
@@ -21,23 +21,30 @@ export function nameOf(url) {
 }
 
 export class Source {
-  /** Bytes that were received. */
+  /** Number of bytes that were received. */
   receivedBytes = 0;
-  /** Bytes of the file; known after the first read. */
+  /** Number of bytes of the file. It is known after the first read. */
   size = -1;
-  /** The whole file, if the server has no ranges. @type {Uint8Array} */
+  /** The whole file if the server does not support ranges. */
   whole = null;
-  /** The size of the file, and its ETag or its date of modification. @type {string} */
+  /**
+   * The size of the file, and its ETag or modification date. They identify its version.
+   */
   version = null;
 
-  /** @param {string} url Absolute. */
+  /**
+   * Store the arguments.
+   *
+   * @param {string} url An absolute URL.
+   */
   constructor(url) {
     this.url = url;
     this.name = nameOf(url);
   }
 
   /**
-   * Return the bytes from `first` to `end`, or to the end of the file if it is shorter.
+   * Return the bytes from `first` to `end`. If the file is shorter, return the bytes up
+   * to its end.
    *
    * @param {number} first
    * @param {number} end
@@ -56,6 +63,8 @@ export class Source {
   }
 
   /**
+   * Request a part of the file.
+   *
    * @param {number} first
    * @param {number} end
    */
@@ -67,7 +76,11 @@ export class Source {
     }
   }
 
-  /** @param {Response} response */
+  /**
+   * Return the body of an answer.
+   *
+   * @param {Response} response
+   */
   async bytesOf(response) {
     try {
       const bytes = new Uint8Array(await response.arrayBuffer());
@@ -79,6 +92,8 @@ export class Source {
   }
 
   /**
+   * Return the requested part from an answer with a range.
+   *
    * @param {Response} response
    * @param {number} first
    * @param {number} end
@@ -97,6 +112,8 @@ export class Source {
   }
 
   /**
+   * Read the whole file from an answer without a range, and return the requested part.
+   *
    * @param {Response} response
    * @param {number} first
    * @param {number} end
@@ -116,6 +133,8 @@ export class Source {
   }
 
   /**
+   * Throw an error if the file has changed on the server.
+   *
    * @param {Response} response
    * @param {number} size
    */

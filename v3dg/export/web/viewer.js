@@ -1,12 +1,14 @@
-// The interface of the viewer: `await open(canvas, url)` shows a scene file or a bundle.
+// The interface of the viewer: `await open(canvas, url)` shows a scene file or a
+// bundle.
 //
-// A worker selects cuts and reads pages (worker.js); this thread draws (renderer.js).
-// The worker sends a page before the first cut that has it, and sends another page to
-// the same place only after a cut without it. So a cut always finds its pages.
+// A worker selects cuts and reads pages (worker.js), and this thread draws
+// (renderer.js). The worker sends a page before the first cut that uses it. It sends
+// another page for the same place only after a cut that does not use the old one.
+// Therefore the pages of a cut are always there.
 //
-// To the worker: open (url, poolBytes), look (request), reset. From the worker: opened
-// (instances, cameras, up, balls), page (place, bytes), cut (cut, tolerance, isSettled,
-// missing, receivedBytes), notice (text), failure (text).
+// Messages to the worker: open (url, poolBytes), look (request), reset. Messages from
+// the worker: opened (instances, cameras, up, balls), page (place, bytes), cut (cut,
+// tolerance, isSettled, missing, receivedBytes), notice (text), failure (text).
 
 import { rotationOf } from "./placement.js";
 import { NoDevice, Renderer } from "./renderer.js";
@@ -22,21 +24,24 @@ const DEFAULTS = {
   background: [0, 0, 0],
 };
 
-/** A scene on a canvas. Events: firstpicture, settled, progress, notice, opened, failure. */
+/**
+ * A scene on a canvas. Its events are firstpicture, settled, progress, notice, opened
+ * and failure.
+ */
 export class Viewer extends EventTarget {
-  /** Cameras of the scene file. @type {import("./scene_file.js").NamedCamera[]} */
+  /** The cameras in the scene file. */
   cameras = [];
-  /** The axis that points up in the scene; null if unknown. */
+  /** The axis that points up in the scene, or null if it is unknown. */
   up = null;
-  /** Centre and radius of the scene; null until it is open. @type {number[]} */
+  /** Centre and radius of the scene; null until the scene is open. */
   ball = null;
-  /** Gaussians of the cut that is drawn. */
+  /** Number of gaussians in the cut that is drawn. */
   numGaussians = 0;
-  /** Tolerance of that cut, which a budget raises, px² a gaussian. */
+  /** Tolerance of that cut, px² per gaussian. A budget raises it. */
   tolerance = 0;
-  /** Bytes that were received. */
+  /** Number of bytes that were received. */
   receivedBytes = 0;
-  /** Whether nothing changes while the camera is still. */
+  /** Whether nothing will change while the camera is still. */
   isSettled = false;
   /** @type {Renderer} */
   renderer = null;
@@ -45,10 +50,10 @@ export class Viewer extends EventTarget {
   /** @type {Pinhole} */
   camera = null;
   isClosed = false;
-  /** The request for a frame; 0 if there is none. */
+  /** The id of the requested frame, or 0 if there is none. */
   request = 0;
   hasPicture = false;
-  /** Frames that were drawn. */
+  /** Number of frames that were drawn. */
   numFrames = 0;
 
   /**
@@ -63,7 +68,7 @@ export class Viewer extends EventTarget {
     this.settings = { ...DEFAULTS, ...options };
   }
 
-  /** Bytes of graphics memory. */
+  /** Number of bytes of graphics memory. */
   get memoryBytes() {
     return this.renderer.memoryBytes;
   }
@@ -90,7 +95,7 @@ export class Viewer extends EventTarget {
     this.renderer.device.lost.then(() => this.recover());
   }
 
-  /** Draw with a new device when the browser has lost the device. */
+  /** If the browser has lost the device, continue with a new one. */
   async recover() {
     if (this.isClosed) return;
     this.emit("notice", { text: "WebGPU: the device was lost; starting it again" });
@@ -107,6 +112,8 @@ export class Viewer extends EventTarget {
   }
 
   /**
+   * Send an event.
+   *
    * @param {string} type
    * @param {object} detail
    */
@@ -114,12 +121,20 @@ export class Viewer extends EventTarget {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
-  /** @param {object} message */
+  /**
+   * Send a message to the worker.
+   *
+   * @param {object} message
+   */
   send(message) {
     this.worker.postMessage(message, []);
   }
 
-  /** @param {any} message */
+  /**
+   * Handle a message from the worker.
+   *
+   * @param {any} message
+   */
   receive(message) {
     if (message.type === "page") this.renderer.writePage(message.place, message.bytes);
     else if (message.type === "cut") this.receiveCut(message);
@@ -127,7 +142,11 @@ export class Viewer extends EventTarget {
     else this.emit(message.type, { text: message.text });
   }
 
-  /** @param {any} message */
+  /**
+   * Handle the message that the scene is open.
+   *
+   * @param {any} message
+   */
   receiveScene({ instances, cameras, up, balls }) {
     this.instances = instances;
     this.cameras = cameras;
@@ -136,7 +155,11 @@ export class Viewer extends EventTarget {
     this.emit("opened");
   }
 
-  /** @param {any} message */
+  /**
+   * Handle the message with a new cut.
+   *
+   * @param {any} message
+   */
   receiveCut({ cut, isSettled, missing, receivedBytes, tolerance }) {
     const most = this.renderer.mostGaussians;
     if (cut.count > most) {
@@ -156,7 +179,7 @@ export class Viewer extends EventTarget {
   }
 
   /**
-   * Set the camera. Its size is that of the picture in px.
+   * Set the camera. Its size is that of the picture, in px.
    *
    * @param {Pinhole} camera
    */
@@ -167,7 +190,7 @@ export class Viewer extends EventTarget {
   }
 
   /**
-   * Change `budget`, `tolerance`, `fade` or `background`.
+   * Change the settings `budget`, `tolerance`, `fade` or `background`.
    *
    * @param {Partial<typeof DEFAULTS>} settings
    */
@@ -186,7 +209,7 @@ export class Viewer extends EventTarget {
     this.send({ type: "look", request });
   }
 
-  /** Draw a frame soon. A still camera draws none. */
+  /** Request a frame. While the camera is still, no frames are drawn. */
   invalidate() {
     if (this.request !== 0 || this.isClosed) return;
     this.request = requestAnimationFrame(() => {
@@ -205,7 +228,7 @@ export class Viewer extends EventTarget {
     renderer.device.queue.onSubmittedWorkDone().then(() => this.emit("firstpicture"));
   }
 
-  /** Return the picture of the present cut, height * width * 4 numbers. */
+  /** Return the picture of the current cut, height * width * 4 numbers. */
   picture() {
     return this.renderer.pictureOf(this.camera, this.instances, this.settings.background);
   }
@@ -223,7 +246,7 @@ export class Viewer extends EventTarget {
  * Return the centre and the radius of a ball around all instances.
  *
  * @param {Instances} instances
- * @param {Float32Array[]} balls Centre and radius of each bundle.
+ * @param {Float32Array[]} balls The centre and the radius of each bundle.
  */
 function ballAround(instances, balls) {
   const low = [Infinity, Infinity, Infinity];
@@ -248,7 +271,7 @@ function ballAround(instances, balls) {
  * Show a scene file or a bundle on a canvas.
  *
  * @param {HTMLCanvasElement} canvas
- * @param {string} url Of a .json or .v3dg file, relative to the page.
+ * @param {string} url The URL of a .json or .v3dg file, relative to the web page.
  * @param {Partial<typeof DEFAULTS>} options
  */
 export async function open(canvas, url, options = {}) {

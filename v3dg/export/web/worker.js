@@ -1,5 +1,5 @@
-// The worker of a viewer: opens the scene, selects the cut of each view, and reads the
-// pages that cuts need. Messages are listed in viewer.js.
+// The worker of a viewer. It opens the scene, selects the cut of each view, and reads
+// the pages that cuts need. viewer.js lists its messages.
 
 import { BundleFile } from "./bundle_file.js";
 import { Bundle, Core, Scene } from "./core.js";
@@ -11,27 +11,40 @@ import { UserError, Source, Unreachable } from "./source.js";
 /** @typedef {import("./page_pool.js").Wanted} Wanted */
 /** @typedef {import("./placement.js").Instances} Instances */
 /** @typedef {import("./placement.js").Pinhole} Pinhole */
-/** @typedef {{ bundle: number, page: number, bytes: Uint8Array }} Loaded */
 /**
+ * A page that was read, and its bytes.
+ *
+ * @typedef {{ bundle: number, page: number, bytes: Uint8Array }} Loaded
+ */
+/**
+ * A request for cuts.
+ *
  * @typedef {object} Request
  * @property {Pinhole} camera
- * @property {number} budget Most gaussians.
- * @property {number} tolerance px² a gaussian.
+ * @property {number} budget The maximum number of gaussians.
+ * @property {number} tolerance The tolerance, px² per gaussian.
  * @property {number} fade
  */
 
 const FRAME_MS = 16;
 const MOST_READS = 6;
-/** Neighbouring pages are read together up to this many bytes. */
+/** Neighbouring pages are read together, up to this number of bytes. */
 const READ_BYTES = 2 ** 18;
 const FIRST_WAIT_MS = 500;
 const MOST_WAIT_MS = 15_000;
-/** Frames until a budget's tolerance is that of a still view (csrc/select/budget_math.h). */
+/**
+ * Number of frames after which the tolerance of a budget is that of a still view
+ * (csrc/select/budget_math.h).
+ */
 const REST_FRAMES = 8;
-/** Pages that wait for a slot, or for the page above them. */
+/** Maximum number of pages that wait for a slot, or for the page above them. */
 const MOST_LOADED = 64;
 
-/** @param {number} ms */
+/**
+ * Return a promise that is fulfilled after some time.
+ *
+ * @param {number} ms The time in milliseconds.
+ */
 function waiting(ms) {
   return new Promise((resolve) => {
     setTimeout(resolve, ms);
@@ -45,14 +58,14 @@ class World {
   framesAtRest = 0;
   isScheduled = false;
   isSettled = false;
-  /** Reads that have begun, by bundle and page. @type {Set<string>} */
+  /** Pages that are being read, by bundle and index. */
   reading = new Set();
   numReads = 0;
-  /** Pages that were read, and are not resident. @type {Loaded[]} */
+  /** Pages that were read and are not resident yet. */
   loaded = [];
   /** @type {Wanted[]} */
   wanted = [];
-  /** Bundles of which nothing more is read. @type {Set<number>} */
+  /** Bundles from which no more pages are read. */
   frozen = new Set();
 
   /**
@@ -86,7 +99,7 @@ class World {
     });
   }
 
-  /** Empty the pool, because the device was lost. */
+  /** Empty the pool after the device was lost. */
   reset() {
     this.pool = new PagePool(this.files, this.pool.bytes);
     this.loaded = [];
@@ -94,14 +107,22 @@ class World {
     this.schedule(0);
   }
 
-  /** @param {Request} request */
+  /**
+   * Store a request, and select its cut.
+   *
+   * @param {Request} request
+   */
   look(request) {
     this.request = request;
     this.framesAtRest = 0;
     this.schedule(0);
   }
 
-  /** @param {number} ms */
+  /**
+   * Run a step after some time.
+   *
+   * @param {number} ms The time in milliseconds.
+   */
   schedule(ms) {
     if (this.isScheduled) return;
     this.isScheduled = true;
@@ -115,7 +136,7 @@ class World {
     }, ms);
   }
 
-  /** Select the cut of a frame, and begin to read what it needs. */
+  /** Select the cut of a frame, and start reading the pages that it needs. */
   step() {
     if (this.request === null) return;
     this.putLoaded();
@@ -152,8 +173,10 @@ class World {
   }
 
   /**
+   * Send a cut to the viewer.
+   *
    * @param {import("./renderer.js").Cut} cut
-   * @param {number} tolerance Of the cut.
+   * @param {number} tolerance The tolerance of the cut.
    * @param {boolean} isSettled Whether nothing will change while the camera is still.
    */
   post(cut, tolerance, isSettled) {
@@ -170,7 +193,9 @@ class World {
     );
   }
 
-  /** Make pages resident that were read. Pages that nothing needs any more are dropped. */
+  /**
+   * Make pages resident that were read. Pages that are no longer needed are dropped.
+   */
   putLoaded() {
     const urgency = new Map(this.wanted.map((one) => [keyOf(one), one.priority]));
     const left = this.loaded.filter((one) => urgency.has(keyOf(one)));
@@ -186,7 +211,7 @@ class World {
     });
   }
 
-  /** Begin to read the most urgent pages. */
+  /** Start reading the most urgent pages. */
   read() {
     const known = new Set([...this.reading, ...this.loaded.map(keyOf)]);
     const open = this.wanted.filter(
@@ -209,6 +234,8 @@ class World {
   }
 
   /**
+   * Read neighbouring pages of a bundle.
+   *
    * @param {number} bundle
    * @param {number} first
    * @param {number} end
@@ -234,7 +261,11 @@ class World {
   }
 }
 
-/** @param {{ bundle: number, page: number }} one */
+/**
+ * Return a key for a page.
+ *
+ * @param {{ bundle: number, page: number }} one
+ */
 function keyOf({ bundle, page }) {
   return `${bundle}/${page}`;
 }
@@ -243,7 +274,7 @@ function keyOf({ bundle, page }) {
  * Try to read until the server answers.
  *
  * @template T
- * @param {() => Promise<T>} read
+ * @param {() => Promise<T>} read Reads once.
  */
 async function retrying(read) {
   let wait = FIRST_WAIT_MS;
@@ -261,7 +292,11 @@ async function retrying(read) {
   }
 }
 
-/** @param {unknown} error */
+/**
+ * Send an error to the viewer.
+ *
+ * @param {unknown} error
+ */
 function report(error) {
   if (error instanceof UserError) {
     postMessage({ type: "notice", text: error.message });
@@ -271,11 +306,11 @@ function report(error) {
 }
 
 /**
- * Return the files of a scene that can be opened, and the instances of those.
+ * Return the files of a scene that can be opened, and their instances.
  *
  * @param {string[]} urls
  * @param {Instances} instances
- * @param {WebAssembly.Module} module The core.
+ * @param {WebAssembly.Module} module The compiled core.
  */
 async function openFiles(urls, instances, module) {
   const core = await Core.load(module);
@@ -300,9 +335,11 @@ async function openFiles(urls, instances, module) {
 }
 
 /**
+ * Return the instances of some bundles.
+ *
  * @param {Instances} all
- * @param {number[]} used
- * @param {number[]} indices Index of each bundle in the subset.
+ * @param {number[]} used The indices of the instances that are kept.
+ * @param {number[]} indices The index of each bundle in the subset.
  * @returns {Instances}
  */
 function subsetOf(all, used, indices) {
@@ -322,6 +359,8 @@ function subsetOf(all, used, indices) {
 let world = null;
 
 /**
+ * Open a scene, and create its pool.
+ *
  * @param {string} url
  * @param {number} poolBytes
  */

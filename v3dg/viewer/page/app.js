@@ -1,4 +1,5 @@
-// The page: creates its parts, handles messages from the server, and acts on keys and buttons.
+// The whole page: creates its parts, handles messages from the server, and executes the
+// actions of keys and buttons.
 
 import { Bookmarks } from "./bookmarks.js";
 import { Camera } from "./camera.js";
@@ -74,15 +75,21 @@ export class App {
 
   // Messages from the server.
 
-  /** @param {boolean} isOpen */
+  /**
+   * Updates the page after the connection was opened or lost.
+   *
+   * @param {boolean} isOpen
+   */
   changeConnection(isOpen) {
     if (isOpen) this.requests.reset();
     else this.status.say("connecting", "no connection to the viewer");
   }
 
   /**
+   * Handles a message from the server.
+   *
    * @param {FromViewer} message
-   * @param {ArrayBuffer | null} bytes
+   * @param {ArrayBuffer | null} bytes The binary data that follows the message.
    */
   take(message, bytes) {
     switch (message.type) {
@@ -120,7 +127,11 @@ export class App {
     }
   }
 
-  /** @param {Hello} greeting */
+  /**
+   * Stores the first message of the server, and shows its scene.
+   *
+   * @param {Hello} greeting
+   */
   greet(greeting) {
     const isFirst = this.greeting === null;
     if (!isFirst && this.greeting.version !== greeting.version) location.reload();
@@ -131,7 +142,11 @@ export class App {
     this.camera.up = greeting.up;
   }
 
-  /** @param {Scene} scene */
+  /**
+   * Shows a scene from its first view, or from the view in the link.
+   *
+   * @param {Scene} scene
+   */
   open(scene) {
     const before = this.scene;
     this.scene = scene;
@@ -188,19 +203,27 @@ export class App {
     this.redraw();
   }
 
-  /** @param {Partial<Settings>} settings */
+  /**
+   * Changes some settings of the picture.
+   *
+   * @param {Partial<Settings>} settings
+   */
   change(settings) {
     Object.assign(this.look.settings, settings);
     this.sync();
   }
 
-  /** Ends the crop if there is one; otherwise deselects the instance. */
+  /** Ends the crop if there is one, and otherwise deselects the instance. */
   letGo() {
     if (this.crop.isOn) this.crop.end();
     else this.instances.select(null);
   }
 
-  /** @param {Mode} mode */
+  /**
+   * Changes how the camera moves.
+   *
+   * @param {Mode} mode
+   */
   setMode(mode) {
     this.camera.mode = mode;
     document.body.dataset.mode = mode;

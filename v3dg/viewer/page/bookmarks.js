@@ -1,4 +1,4 @@
-// Bookmarks: links to views of a scene, which the browser stores.
+// Bookmarks are links to views of a scene. The browser stores them.
 
 /** @typedef {import("./app.js").App} App */
 /** @typedef {{ name: string, hash: string }} Bookmark */
@@ -17,7 +17,7 @@ export class Bookmarks {
     return `v3dg:${this.app.scene.name}`;
   }
 
-  /** Loads the bookmarks of the scene; unreadable ones are skipped. */
+  /** Loads the bookmarks of the scene. Unreadable ones are skipped. */
   load() {
     /** @type {Bookmark[]} */
     let saved = [];
@@ -51,13 +51,21 @@ export class Bookmarks {
     app.status.confirm(`Bookmark ${this.list.length} was added.`);
   }
 
-  /** @param {number} index */
+  /**
+   * Removes a bookmark by its index.
+   *
+   * @param {number} index
+   */
   remove(index) {
     this.list.splice(index, 1);
     this.save();
   }
 
-  /** @param {number} index */
+  /**
+   * Opens the view of a bookmark.
+   *
+   * @param {number} index
+   */
   open(index) {
     const bookmark = this.list[index];
     if (bookmark) this.app.linkState.open(bookmark.hash, "fly");

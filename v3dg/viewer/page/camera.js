@@ -1,4 +1,4 @@
-// The camera of the page, and how it moves. Lengths are in world units.
+// The camera of the page, and its movements. Lengths are in world units.
 
 import * as M from "./math.js";
 
@@ -22,12 +22,13 @@ export const AXES = {
 export const MODES = ["orbit", "fly", "walk"];
 export const SPEED_BOUNDS = [0.01, 100];
 const FLIGHT_SECONDS = 0.6;
-/** Largest sine of the angle between the view direction and the horizon. */
+/** Largest sine of the angle between the viewing direction and the horizon. */
 const STEEPEST = 0.998;
 /** Time constant in seconds with which the velocity approaches the requested one. */
 const EASE_SECONDS = 0.07;
 
 /**
+ * Returns whether a text is the name of a mode.
  * @param {string} text
  * @returns {text is Mode}
  */
@@ -38,37 +39,32 @@ export function isMode(text) {
 export class Camera {
   /** @type {Vector} */
   position = [0, -3, 1];
-  /** Rotation from camera (x right, y down, z forward) to world. */
+  /** Rotation from the camera's axes (x right, y down, z forward) to the world. */
   wxyz = M.looking([0, 3, -1], [0, 0, 1]);
   /** Vertical field of view, radians. */
   fov_y = Math.PI / 4;
-  /**
-   * The point around which the camera orbits.
-   *
-   * @type {Vector}
-   */
+  /** @type {Vector} The point that the camera orbits. */
   focus = [0, 0, 0];
   /** @type {Vector} */
   up = [0, 0, 1];
   /** @type {Mode} */
   mode = MODES[0];
-  /** Factor of the speed that suits the scene. */
+  /** Factor by which the user changes the speed. At 1, it suits the scene. */
   speed = 1;
   /** Radius of the scene. */
   radius = 1;
   /**
-   * Distance to whatever is in the middle of the picture; null if unknown.
-   *
+   * Distance to the object in the middle of the picture; null if it is unknown.
    * @type {number}
    */
   ahead = null;
   /** @type {Vector} */
   velocity = [0, 0, 0];
-  /** Time in seconds for which the user has been moving while an object is near. */
+  /** Time in seconds for which the user has kept moving towards a near object. */
   pushedSeconds = 0;
   /**
-   * A flight to another view, with the seconds since its start; null if there is none.
-   *
+   * The current flight to another view, with the seconds since its start; null if there
+   * is none.
    * @type {{ from: FlightEnd, to: FlightEnd, seconds: number }}
    */
   flight = null;
@@ -90,25 +86,32 @@ export class Camera {
     return Math.max(M.length(M.sub(this.focus, this.position)), 1e-4 * this.radius);
   }
 
-  /** World units per second. The speed depends on the scene's size, and is lower near objects. */
+  /**
+   * Speed in world units per second. It depends on the scene's size, and is lower near
+   * objects.
+   */
   get pace() {
     const near = this.ahead ?? this.radius;
     return this.speed * M.clamp(0.6 * near, this.leastPace, 0.6 * this.radius);
   }
 
-  /** Minimum speed near objects. It is low at first, and rises if the user keeps moving. */
+  /**
+   * Minimum speed near objects. It starts low, and rises while the user keeps moving.
+   */
   get leastPace() {
     return 0.02 * this.radius * M.clamp(2 ** (2 * (this.pushedSeconds - 0.5)), 1, 10);
   }
 
-  /** @param {number} aspect */
+  /**
+   * Returns the camera's view, for a picture of this aspect ratio.
+   * @param {number} aspect
+   */
   view(aspect) {
     return { wxyz: this.wxyz, position: this.position, fov_y: this.fov_y, aspect };
   }
 
   /**
-   * Whether a view equals the camera's view, except for rounding.
-   *
+   * Returns whether a view equals the camera's view, except for rounding.
    * @param {Pinhole} view
    */
   isAt(view) {
@@ -118,18 +121,20 @@ export class Camera {
     return isTurned && isThere && Math.abs(view.fov_y - this.fov_y) < 1e-9;
   }
 
-  /** @param {number} speed */
+  /**
+   * Sets the factor of the speed, within its limits.
+   * @param {number} speed
+   */
   setSpeed(speed) {
     const [slowest, fastest] = SPEED_BOUNDS;
     this.speed = M.clamp(speed, slowest, fastest);
   }
 
   /**
-   * Turns by yaw around the up axis and by pitch around the horizontal axis; in orbit mode around
-   * the focus.
-   *
-   * @param {number} yaw Radians.
-   * @param {number} pitch Radians.
+   * Turns the camera by a yaw around the up axis and a pitch around the horizontal
+   * axis. In orbit mode, the camera moves around the focus.
+   * @param {number} yaw In radians.
+   * @param {number} pitch In radians.
    */
   turn(yaw, pitch) {
     this.flight = null;
@@ -142,21 +147,23 @@ export class Camera {
     if (this.mode !== "orbit") this.carryFocus();
   }
 
-  /** @param {Quaternion} rotation */
+  /**
+   * Sets the rotation of the camera. In orbit mode, the camera moves around the focus.
+   * @param {Quaternion} rotation
+   */
   rotate(rotation) {
     const pivot = this.mode === "orbit" ? this.focus : this.position;
     this.wxyz = M.unit(M.product(rotation, this.wxyz));
     this.position = M.add(pivot, M.rotate(rotation, M.sub(this.position, pivot)));
   }
 
-  /** Moves the focus in front of the camera, at the same distance as before. */
+  /** Places the focus in front of the camera, at the same distance as before. */
   carryFocus() {
     this.focus = M.add(this.position, M.mul(this.forward, this.distance));
   }
 
   /**
    * Moves by distances along the camera's axes.
-   *
    * @param {number} right
    * @param {number} down
    * @param {number} forward
@@ -167,16 +174,19 @@ export class Camera {
     this.moveBy(M.add(sideways, M.mul(this.forward, forward)));
   }
 
-  /** @param {Vector} step In the world. */
+  /**
+   * Moves the camera by a vector.
+   * @param {Vector} step The vector in world coordinates.
+   */
   moveBy(step) {
     this.position = M.add(this.position, step);
     this.focus = M.add(this.focus, step);
   }
 
   /**
-   * Changes the distance to the focus by a factor. If the focus is reached, it is moved ahead.
-   *
-   * @param {number} factor Of the distance.
+   * Multiplies the distance to the focus by a factor. If the camera reaches the focus,
+   * the focus is moved ahead.
+   * @param {number} factor The factor of the distance.
    */
   approach(factor) {
     this.flight = null;
@@ -189,7 +199,7 @@ export class Camera {
     this.position = M.add(this.focus, M.mul(away, factor));
   }
 
-  /** The directions of movements to the right, up and forward. */
+  /** The directions in which the camera moves to the right, up and forward. */
   get pushDirections() {
     if (this.mode === "walk") return [this.right, this.up, M.unit(M.cross(this.up, this.right))];
     if (this.mode === "fly") return [this.right, M.mul(this.down, -1), this.forward];
@@ -197,9 +207,8 @@ export class Camera {
   }
 
   /**
-   * Moves the camera during some time.
-   *
-   * @param {Vector} push To the right, up and forward, each -1 to 1.
+   * Moves the camera for some time.
+   * @param {Vector} push Movement to the right, up and forward; each is -1 to 1.
    * @param {number} seconds
    */
   move(push, seconds) {
@@ -226,9 +235,8 @@ export class Camera {
   }
 
   /**
-   * Moves the camera to a view at once. The focus is ahead of the camera, at the same distance as
-   * before.
-   *
+   * Moves the camera to a view without a flight. The focus is placed in front of the
+   * camera, at the same distance as before.
    * @param {Pinhole} view
    */
   put(view) {
@@ -243,9 +251,9 @@ export class Camera {
 
   /**
    * Starts a flight to a view.
-   *
    * @param {Pinhole} view
-   * @param {Vector | null} focus The focus of the view; null means a point ahead of it.
+   * @param {Vector | null} focus The focus of the view; null for a point in front of
+   *   it.
    */
   flyTo(view, focus) {
     const forward = M.rotate(view.wxyz, [0, 0, 1]);
@@ -255,8 +263,8 @@ export class Camera {
   }
 
   /**
-   * Starts a flight to a view of a point, from the present side of the point.
-   *
+   * Starts a flight to a view of a point. The camera stays on the side of the point
+   * where it is now.
    * @param {Vector} point
    * @param {number} distance
    */
@@ -267,7 +275,9 @@ export class Camera {
     this.flyTo({ wxyz, position, fov_y: this.fov_y }, point);
   }
 
-  /** @param {number} seconds The time by which a flight advances. */
+  /**
+   * @param {number} seconds The time since the last call.
+   */
   advance(seconds) {
     if (!this.flight) return;
     const { from, to } = this.flight;

@@ -1,7 +1,7 @@
-// Conversion of colours between text and numbers.
+// Converts colours between text and numbers.
 
 /**
- * Returns a colour as #rrggbb.
+ * Returns a colour as text of the form #rrggbb.
  *
  * @param {number[]} color Red, green and blue, 0 to 1.
  */
@@ -15,7 +15,8 @@ export function hexOf(color) {
 }
 
 /**
- * Returns red, green and blue, 0 to 1; black if a text is not a colour.
+ * Returns red, green and blue, 0 to 1. If the text is not a colour, the result is
+ * black.
  *
  * @param {string} text Six hexadecimal digits, with or without #.
  * @returns {[number, number, number]}

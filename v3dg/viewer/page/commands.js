@@ -6,7 +6,10 @@ import { MODES } from "./camera.js";
 
 const SPEED_STEP = 1.5;
 
-/** Actions by the code of a key, which depends on its position on the keyboard. */
+/**
+ * Actions by the code of a key. The code depends on the position of the key on the
+ * keyboard.
+ */
 const COMMANDS = /** @type {Record<string, (app: App) => void>} */ ({
   KeyH: (app) => app.places.showAll(),
   KeyL: (app) => app.places.level(),
@@ -21,7 +24,7 @@ const COMMANDS = /** @type {Record<string, (app: App) => void>} */ ({
 });
 
 /**
- * Executes the action of a key; returns whether it has one.
+ * Executes the action of a key. Returns false if the key has none.
  *
  * @param {App} app
  * @param {KeyboardEvent} event
@@ -51,6 +54,8 @@ export function runCommand(app, event) {
 }
 
 /**
+ * Multiplies the speed of the camera by a factor.
+ *
  * @param {App} app
  * @param {number} factor
  */

@@ -8,9 +8,12 @@ import { element } from "./elements.js";
 
 /** Colours of the x, y and z axes. */
 export const AXIS_COLORS = ["#ff6b5e", "#7ad97a", "#5aa9ff"];
-/** Makes axes visible on bright pictures. */
+/** A dark outline makes the axes visible on bright pictures. */
 const EDGE_COLOR = "#000c";
-/** In px of the page: the side of the canvas, the length of an axis, the distance of its name. */
+/**
+ * Lengths in px of the page: the side of the canvas, the length of an axis, and the
+ * distance of an axis's name.
+ */
 const SIDE = 80;
 const MIDDLE = SIDE / 2;
 const ARM = 20;
@@ -25,7 +28,11 @@ export class Compass {
     this.camera = camera;
   }
 
-  /** @param {number} ratio Px of the screen for each px of the page. */
+  /**
+   * Adapts the canvas to the screen.
+   *
+   * @param {number} ratio Number of screen px for each px of the page.
+   */
   resize(ratio) {
     this.canvas.width = Math.round(SIDE * ratio);
     this.canvas.height = Math.round(SIDE * ratio);
@@ -46,13 +53,17 @@ export class Compass {
       direction: M.rotate(toCamera, AXES[name]),
       color: AXIS_COLORS[i],
     }));
-    axes.sort((a, b) => b.direction[2] - a.direction[2]); // the farthest first
+    // draw the farthest axis first
+    axes.sort((a, b) => b.direction[2] - a.direction[2]);
     for (const { name, direction, color } of axes) this.drawAxis(name, direction, color);
   }
 
   /**
+   * Draws an axis and its name.
+   *
    * @param {string} name
-   * @param {import("./page.js").Vector} direction In the camera's coordinates.
+   * @param {import("./page.js").Vector} direction The end of the axis in the camera's
+   *   coordinates.
    * @param {string} color
    */
   drawAxis(name, [x, y], color) {

@@ -1,13 +1,14 @@
-// The connection to the server. It is opened again when it is lost.
+// The connection to the server. If it is lost, it is opened again.
 
 /** @typedef {import("./protocol.js").FromPage} FromPage */
 /** @typedef {import("./protocol.js").FromViewer} FromViewer */
 
 const RETRY_MS = 1000;
-/** No picture is requested while more than this number of bytes waits to be sent. */
+/** No picture is requested while more bytes than this wait to be sent. */
 const MOST_WAITING_BYTES = 1 << 16;
 /**
- * Size of the pieces in which files are sent, and the number of pieces that may wait to be sent.
+ * Files are sent in pieces of this size. At most this number of pieces may wait to be
+ * sent.
  */
 const PIECE_BYTES = 1 << 19;
 const MOST_WAITING_PIECES = 4;
@@ -17,9 +18,12 @@ export class Connection {
   socket = null;
 
   /**
+   * Opens the connection.
+   *
    * @param {(message: FromViewer, bytes: ArrayBuffer | null) => void} take Called with each
    *   message, and with the binary data that follows it.
-   * @param {(isOpen: boolean) => void} changed Called when the connection is opened or lost.
+   * @param {(isOpen: boolean) => void} changed Called when the connection is opened or
+   *   lost.
    */
   constructor(take, changed) {
     this.take = take;
@@ -43,8 +47,8 @@ export class Connection {
   }
 
   /**
-   * A message is text; or binary data with the length of the text (4 bytes), the text, and more
-   * data.
+   * Reads a message. It is either text, or binary data that consists of the length of
+   * the text (4 bytes), the text, and more data.
    *
    * @param {string | ArrayBuffer} data
    */
@@ -67,16 +71,21 @@ export class Connection {
     return this.isOpen && this.socket.bufferedAmount < MOST_WAITING_BYTES;
   }
 
-  /** @param {FromPage} message */
+  /**
+   * Sends a message. If there is no connection, the message is lost.
+   *
+   * @param {FromPage} message
+   */
   send(message) {
     if (this.isOpen) this.socket.send(JSON.stringify(message));
   }
 
   /**
-   * Sends a file in pieces; stops if the connection is lost.
+   * Sends a file in pieces. Stops if the connection is lost.
    *
    * @param {File} file
-   * @param {(share: number) => void} progress Called with the fraction that has been sent, 0 to 1.
+   * @param {(share: number) => void} progress Called with the fraction that has been
+   *   sent, 0 to 1.
    */
   async sendFile(file, progress) {
     this.send({ type: "open", name: file.name, size: file.size });

@@ -1,5 +1,5 @@
-// The panel's controls. Each is created in an element, calls a function when it is used, and can be
-// set to a value that was chosen elsewhere.
+// Controls of the panel. Each control is added to an element, calls a function when it
+// is used, and can be set to a value that was chosen elsewhere.
 
 import { make } from "./elements.js";
 
@@ -31,7 +31,7 @@ const LOGARITHMIC_STEP = 0.01;
  * @param {string} label
  * @param {HTMLElement} control
  * @param {string} title
- * @param {Node | string} output Shown between the label and the control.
+ * @param {Node | string} output An element between the label and the control.
  */
 export function addLabelled(parent, label, control, title = "", output = "") {
   control.setAttribute("aria-label", label);
@@ -41,10 +41,12 @@ export function addLabelled(parent, label, control, title = "", output = "") {
 }
 
 /**
+ * Adds a slider.
+ *
  * @param {HTMLElement} parent
  * @param {string} label
  * @param {Range} range
- * @param {(value: number) => void} act
+ * @param {(value: number) => void} act Called with the new value.
  * @returns {Control<number>}
  */
 export function addSlider(parent, label, range, act) {
@@ -70,17 +72,23 @@ export function addSlider(parent, label, range, act) {
   return { element: addLabelled(parent, label, control, title, output), set };
 }
 
-/** @param {Range} range */
+/**
+ * Returns the functions that convert between the value of a slider and its position.
+ *
+ * @param {Range} range
+ */
 function scaleOf({ isLogarithmic, step }) {
   if (isLogarithmic) return { toSlider: Math.log, fromSlider: Math.exp, step: LOGARITHMIC_STEP };
   return { toSlider: Number, fromSlider: Number, step };
 }
 
 /**
+ * Adds a checkbox.
+ *
  * @param {HTMLElement} parent
  * @param {string} label
  * @param {{ value: boolean, title: string }} state
- * @param {(value: boolean) => void} act
+ * @param {(value: boolean) => void} act Called with the new value.
  * @returns {Control<boolean>}
  */
 export function addCheckbox(parent, label, { value, title }, act) {
@@ -93,10 +101,12 @@ export function addCheckbox(parent, label, { value, title }, act) {
 }
 
 /**
+ * Adds a colour picker.
+ *
  * @param {HTMLElement} parent
  * @param {string} label
- * @param {{ value: string, title: string }} state The colour as #rrggbb.
- * @param {(value: string) => void} act
+ * @param {{ value: string, title: string }} state The colour as #rrggbb, and the title.
+ * @param {(value: string) => void} act Called with the new value.
  * @returns {Control<string>}
  */
 export function addColor(parent, label, { value, title }, act) {
@@ -109,10 +119,13 @@ export function addColor(parent, label, { value, title }, act) {
 }
 
 /**
+ * Adds a list of options.
+ *
  * @param {HTMLElement} parent
  * @param {string} label
- * @param {{ options: string[][], value: string, title?: string }} state Pairs of key and text.
- * @param {(value: string) => void} act
+ * @param {{ options: string[][], value: string, title?: string }} state Pairs of key
+ *   and text, the key that is chosen, and the title.
+ * @param {(value: string) => void} act Called with the new key.
  * @returns {Control<string>}
  */
 export function addSelect(parent, label, { options, value, title }, act) {
@@ -127,9 +140,11 @@ export function addSelect(parent, label, { options, value, title }, act) {
 }
 
 /**
+ * Adds a button.
+ *
  * @param {HTMLElement} parent
  * @param {string} label
- * @param {() => void} act
+ * @param {() => void} act Called when the button is pressed.
  * @param {string} title
  */
 export function addButton(parent, label, act, title = "") {
@@ -139,27 +154,43 @@ export function addButton(parent, label, act, title = "") {
   return element;
 }
 
-/** @param {HTMLElement} parent */
+/**
+ * Adds an element whose children are in one row.
+ *
+ * @param {HTMLElement} parent
+ */
 export function addRow(parent) {
   const element = make("div", { className: "row" });
   parent.append(element);
   return element;
 }
 
-/** @param {HTMLElement} parent */
+/**
+ * Adds an element for less important text.
+ *
+ * @param {HTMLElement} parent
+ */
 export function addFaintText(parent) {
   const element = make("p", { className: "faint" });
   parent.append(element);
   return element;
 }
 
-/** @param {(Node | string)[][]} rows The cells of each row. */
+/**
+ * Returns a table of texts.
+ *
+ * @param {(Node | string)[][]} rows The cells of each row.
+ */
 export function tableOf(rows) {
   const lines = rows.map((cells) => make("tr", {}, ...cells.map((cell) => make("td", {}, cell))));
   return make("table", {}, ...lines);
 }
 
-/** @param {number} value */
+/**
+ * Returns a number as text with a few digits.
+ *
+ * @param {number} value
+ */
 export function shortText(value) {
   return String(Number(value.toPrecision(3)));
 }

@@ -1,4 +1,4 @@
-// The box by which an asset is cropped. Its faces can be dragged, and the inside or the outside of
+// The box that crops an asset. Its faces can be dragged. The inside or the outside of
 // the box is saved as a new asset.
 
 import * as M from "./math.js";
@@ -12,14 +12,18 @@ import { edgesOf } from "./handles.js";
 /** @typedef {import("./projection.js").Projection} Projection */
 /** @typedef {import("./protocol.js").Crop} CropMessage */
 /** @typedef {import("./protocol.js").Picked} Picked */
-/** @typedef {[Vector, Vector]} Box Minimum and maximum corner. */
+/**
+ * A box, given by its minimum and its maximum corner.
+ *
+ * @typedef {[Vector, Vector]} Box Minimum and maximum corner.
+ */
 /** @typedef {{ axis: number, end: 0 | 1 }} Face One of the six faces, by axis and corner. */
 
 const BOX_COLOR = "#5ad1ff";
 const HANDLE_RADIUS = 7;
 /**
- * Square of the smallest sine of the angle between an axis and the line of sight at which a face
- * can be dragged along this axis.
+ * A face can only be dragged if the angle between its axis and the line of sight is
+ * large enough. This is the square of the smallest sine.
  */
 const LEAST_SINE2 = 1e-3;
 const LOCAL_AXES = [AXES.x, AXES.y, AXES.z];
@@ -50,11 +54,11 @@ export class Crop {
   keep = "inside";
   /** Name of the new file. */
   name = "";
-  /** Whether the subject was requested from the server. */
+  /** Whether the viewer waits for the server to send the subject. */
   isWaiting = false;
   /**
-   * The face that is dragged, with the pointer's place and the box at the start of the drag; null
-   * if no face is dragged.
+   * The face that is being dragged, with the pointer's position and the box at the
+   * start of the drag; null if there is none.
    *
    * @type {{ face: Face, start: Place, box: Box }}
    */
@@ -73,7 +77,7 @@ export class Crop {
     return this.subject !== null;
   }
 
-  /** Starts with the selected instance, or with the only instance. */
+  /** Starts a crop of the selected instance, or of the only instance. */
   begin() {
     const { connection, instances, look } = this.app;
     if (instances.selected) {
@@ -84,7 +88,11 @@ export class Crop {
     connection.send({ type: "pick", look: look.message, instance: 0 });
   }
 
-  /** @param {Picked} picked The instance whose bundle is cropped. */
+  /**
+   * Begins the crop of a bundle.
+   *
+   * @param {Picked} picked An instance of the bundle.
+   */
   take(picked) {
     this.isWaiting = false;
     if (picked.instance === undefined) return;
@@ -96,8 +104,8 @@ export class Crop {
   }
 
   /**
-   * Returns a box around nearly all of a bundle. If the bundle is the whole scene, far outliers are
-   * outside of the box.
+   * Returns a box around nearly all of a bundle. If the bundle is the whole scene,
+   * distant outliers are outside the box.
    *
    * @param {Picked} picked
    * @returns {Box}
@@ -127,7 +135,7 @@ export class Crop {
     this.app.sync();
   }
 
-  /** The box in the form that `v3dg convert --crop` accepts. */
+  /** The box as text that `v3dg convert --crop` accepts. */
   get text() {
     return `box:${this.box.flat().map(fiveDigits).join(",")}`;
   }
@@ -137,7 +145,11 @@ export class Crop {
     this.app.connection.send({ type: "crop", instance: subject.instance, box, keep, name });
   }
 
-  /** @param {Vector} point A point in the coordinates of the bundle. */
+  /**
+   * Converts a point to world coordinates.
+   *
+   * @param {Vector} point A point in the coordinates of the bundle.
+   */
   inWorld(point) {
     const { pose } = this.subject;
     return M.add(pose.position, M.mul(M.rotate(pose.quaternion, point), pose.scale));
@@ -172,8 +184,8 @@ export class Crop {
   }
 
   /**
-   * Starts to drag the face whose handle is nearest to a place in the picture; returns whether
-   * there is one.
+   * Starts to drag the face whose handle is nearest to a position in the picture.
+   * Returns false if there is none.
    *
    * @param {number} x
    * @param {number} y
@@ -193,7 +205,7 @@ export class Crop {
   }
 
   /**
-   * Moves the dragged face along its axis, but not beyond the opposite face.
+   * Moves the dragged face along its axis, up to the opposite face.
    *
    * @param {number} x
    * @param {number} y
@@ -211,8 +223,9 @@ export class Crop {
   }
 
   /**
-   * Returns the distance from a face, along its axis, of the point that is closest to the ray
-   * through a place in the picture; null if the axis points to the eye.
+   * Finds the point on a face's axis that is closest to the ray through a position in
+   * the picture. Returns its distance from the face along the axis, or null if the axis
+   * points to the eye.
    *
    * @param {Face} face
    * @param {Place} place
@@ -235,7 +248,11 @@ export class Crop {
   }
 }
 
-/** @param {number} value */
+/**
+ * Rounds a number to five digits.
+ *
+ * @param {number} value
+ */
 function fiveDigits(value) {
   return Number(value.toPrecision(5));
 }

@@ -1,10 +1,14 @@
-// Sends files that are dropped onto the page to the viewer, which then shows them.
+// Sends files that are dropped onto the web page to the viewer, which then shows them.
 
 import { element } from "./elements.js";
 
 /** @typedef {import("./app.js").App} App */
 
-/** @param {App} app */
+/**
+ * Accepts files that are dropped onto the web page.
+ *
+ * @param {App} app
+ */
 export function acceptDrops(app) {
   const sign = element("drop");
   window.addEventListener("dragover", (event) => {
@@ -23,6 +27,8 @@ export function acceptDrops(app) {
 }
 
 /**
+ * Sends a file to the viewer, and shows the progress.
+ *
  * @param {App} app
  * @param {File} file
  */

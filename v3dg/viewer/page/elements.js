@@ -1,12 +1,17 @@
-// Finds elements of index.html by their ids, and creates new elements.
+// Finds elements of index.html by their ids, and creates elements.
 
-/** @param {string} id */
+/**
+ * Returns the element with an id.
+ *
+ * @param {string} id
+ */
 export function element(id) {
   return document.getElementById(id);
 }
 
 /**
- * Creates an element. Attributes that are properties of the element are set as properties.
+ * Creates an element. An attribute that is a property of the element is set as a
+ * property.
  *
  * @template {keyof HTMLElementTagNameMap} Tag
  * @param {Tag} tag

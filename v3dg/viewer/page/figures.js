@@ -1,4 +1,4 @@
-// The panel's statistics of the last picture, and the legend of its colours.
+// The statistics of the last picture in the panel, and the legend of its colours.
 
 import { shortText, tableOf } from "./controls.js";
 import { make } from "./elements.js";
@@ -7,6 +7,8 @@ import { make } from "./elements.js";
 /** @typedef {import("./protocol.js").Scene} Scene */
 
 /**
+ * Returns the statistics of a picture as elements.
+ *
  * @param {Picture} picture
  * @param {Scene} scene
  * @returns {HTMLElement[]}
@@ -16,7 +18,11 @@ export function figuresOf(picture, scene) {
   return [tableOf(rowsOf(picture)), ...legendOf(picture, scene), ...histogramOf(levels, scene)];
 }
 
-/** @param {Picture} picture */
+/**
+ * Returns the rows of the table of statistics.
+ *
+ * @param {Picture} picture
+ */
 function rowsOf({ figures, size }) {
   const mebibytes = Math.round(figures.memory_bytes / 2 ** 20);
   const rows = [
@@ -33,6 +39,8 @@ function rowsOf({ figures, size }) {
 }
 
 /**
+ * Returns the legend of a picture's colours.
+ *
  * @param {Picture} picture
  * @param {Scene} scene
  * @returns {HTMLElement[]}
@@ -61,8 +69,10 @@ function legendOf({ shows, range }, scene) {
 }
 
 /**
- * @param {string[]} colors Colours of a gradient, from left to right.
- * @param {string[]} marks Labels below the gradient.
+ * Returns a colour gradient with labels.
+ *
+ * @param {string[]} colors The colours of the gradient, from left to right.
+ * @param {string[]} marks The labels below the gradient.
  */
 function barOf(colors, marks) {
   const ramp = make("div", { className: "ramp" });
@@ -71,7 +81,7 @@ function barOf(colors, marks) {
 }
 
 /**
- * Shows the number of selected gaussians of each level.
+ * Shows the number of selected gaussians of each level as bars.
  *
  * @param {number[]} levels
  * @param {Scene} scene
@@ -89,17 +99,29 @@ function histogramOf(levels, scene) {
   return [make("div", { className: "levels" }, ...bars), marks];
 }
 
-/** @param {string[]} marks */
+/**
+ * Returns labels in a row.
+ *
+ * @param {string[]} marks
+ */
 function marksOf(marks) {
   return make("div", { className: "marks" }, ...marks.map((mark) => make("span", {}, mark)));
 }
 
-/** @param {number[]} color */
+/**
+ * Returns a colour as text for CSS.
+ *
+ * @param {number[]} color
+ */
 function cssColor(color) {
   return `rgb(${color})`;
 }
 
-/** @param {number} count */
+/**
+ * Returns an integer as text with groups of three digits.
+ *
+ * @param {number} count
+ */
 export function grouped(count) {
   return count.toLocaleString("en");
 }

@@ -1,4 +1,5 @@
-// The cameras of the file: frusta to click, and photographs that are shown over the picture.
+// The cameras of the file. Their frusta can be clicked, and their photographs are shown
+// over the picture.
 
 import * as M from "./math.js";
 import { element } from "./elements.js";
@@ -16,10 +17,10 @@ export class FileCameras {
   frustumSize = 0.05;
   /** Opacity of photographs. */
   opacity = 0.5;
-  /** Index of the camera whose frustum is under the pointer; -1 if there is none. */
+  /** Index of the camera whose frustum is under the pointer, or -1. */
   hovered = -1;
   /**
-   * The view of the photograph that is shown; null if none is shown.
+   * The view of the photograph that is shown; null if there is none.
    *
    * @type {View}
    */
@@ -30,7 +31,11 @@ export class FileCameras {
     this.app = app;
   }
 
-  /** @param {FileCamera[]} cameras */
+  /**
+   * Sets the cameras of a scene.
+   *
+   * @param {FileCamera[]} cameras
+   */
   begin(cameras) {
     this.list = cameras;
     this.showsFrusta = this.hasPhotographs;
@@ -45,25 +50,41 @@ export class FileCameras {
     return this.list.some((camera) => camera.photograph);
   }
 
-  /** @param {boolean} isShown */
+  /**
+   * Shows or hides the frusta.
+   *
+   * @param {boolean} isShown
+   */
   showFrusta(isShown) {
     this.showsFrusta = isShown;
     this.app.sync();
   }
 
-  /** @param {number} size */
+  /**
+   * Sets the depth of frusta, in radii of the scene.
+   *
+   * @param {number} size
+   */
   setFrustumSize(size) {
     this.frustumSize = size;
     this.app.sync();
   }
 
-  /** @param {number} opacity */
+  /**
+   * Sets the opacity of photographs.
+   *
+   * @param {number} opacity
+   */
   setOpacity(opacity) {
     this.opacity = opacity;
     this.app.sync();
   }
 
-  /** @param {number} index */
+  /**
+   * Highlights the frustum of a camera.
+   *
+   * @param {number} index The index of the camera, or -1.
+   */
   hover(index) {
     if (index === this.hovered) return;
     this.hovered = index;
@@ -71,13 +92,18 @@ export class FileCameras {
     this.app.redraw();
   }
 
-  /** @param {string} name */
+  /**
+   * Returns the index of the camera with a name, or -1.
+   *
+   * @param {string} name
+   */
   indexOf(name) {
     return this.list.findIndex((camera) => camera.name === name);
   }
 
   /**
-   * Flies to a camera, so that its whole picture fits into the window, and shows its photograph.
+   * Flies to a camera, such that its whole picture fits into the window, and shows its
+   * photograph.
    *
    * @param {number} index
    */
@@ -104,7 +130,7 @@ export class FileCameras {
    * Positions the photograph in the window.
    *
    * @param {View} view The view of the photograph's camera.
-   * @param {number} tangent Tangent of half the window's vertical field of view.
+   * @param {number} tangent The tangent of half the window's vertical field of view.
    */
   fitPhotograph(view, tangent) {
     const { clientWidth, clientHeight } = this.app.look.stage;
@@ -117,7 +143,7 @@ export class FileCameras {
     style.height = `${height}px`;
   }
 
-  /** Shows the photograph if the camera is at its view, and hides it otherwise. */
+  /** Shows the photograph while the camera is at its view, and otherwise hides it. */
   placePhotograph() {
     const isThere = this.photographView !== null && this.app.camera.isAt(this.photographView);
     this.photograph.hidden = !isThere || this.opacity === 0;

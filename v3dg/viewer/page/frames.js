@@ -1,15 +1,20 @@
-// The browser's frames: advances movements, requests pictures, and draws the page.
+// The frames of the browser. In each, movements advance, pictures are requested, and
+// the web page is drawn.
 
 import * as M from "./math.js";
 
 /** @typedef {import("./app.js").App} App */
 
-/** Maximum time step in seconds, so that the camera does not jump after the tab was hidden. */
+/**
+ * Maximum time step in seconds. Without it, the camera would jump after the tab was
+ * hidden.
+ */
 const MOST_FRAME_SECONDS = 0.1;
 const LEAST_FRAME_SECONDS = 1e-3;
 /**
- * If the browser needs longer than this for a frame, as without a GPU, the last picture follows the
- * camera only every `SELDOM_MS`, because the server may use the same CPU.
+ * If the browser needs longer than this for a frame, it has no GPU. The last picture
+ * then follows the camera only every `SELDOM_MS`, because the server may use the same
+ * CPU.
  */
 const SLOW_FRAME_MS = 25;
 const SELDOM_MS = 100;
@@ -17,15 +22,15 @@ const SELDOM_MS = 100;
 export class Frames {
   /** Whether `draw` is scheduled for the next frame. */
   isDue = false;
-  /** Whether a picture has arrived that is not drawn yet. */
+  /** Whether a picture has arrived that has not been drawn yet. */
   hasNewPicture = false;
   /** Time of the last frame, ms. */
   last = 0;
   /** Time at which the last frame was scheduled, ms. */
   requestedAt = 0;
-  /** Time at which the page was last drawn, ms. */
+  /** Time at which the web page was last drawn, ms. */
   drawnAt = 0;
-  /** Time that the browser needs for a frame in which it draws, ms. */
+  /** Time that the browser needs for a frame with drawing, ms. */
   frameMs = 0;
 
   /** @param {App} app */
@@ -34,8 +39,8 @@ export class Frames {
   }
 
   /**
-   * Draws the page in the next frame, and requests a picture if the view or the settings have
-   * changed.
+   * Draws the web page in the next frame. If the view or the settings have changed, a
+   * picture is requested.
    */
   redraw() {
     if (this.isDue) return;
@@ -44,7 +49,11 @@ export class Frames {
     requestAnimationFrame((now) => this.draw(now));
   }
 
-  /** @param {number} now Time of the frame, ms. */
+  /**
+   * Draws a frame.
+   *
+   * @param {number} now Time of the frame, ms.
+   */
   draw(now) {
     const { app } = this;
     this.isDue = false;
@@ -71,9 +80,9 @@ export class Frames {
   }
 
   /**
-   * Advances all movements; returns whether the camera is moving.
+   * Advances all movements. Returns whether the camera is moving.
    *
-   * @param {number} now
+   * @param {number} now Time of the frame, ms.
    * @param {number} seconds
    */
   advance(now, seconds) {
@@ -85,9 +94,9 @@ export class Frames {
   }
 
   /**
-   * Whether the browser is too slow to draw the page again now.
+   * Returns whether a slow browser should not draw the web page again yet.
    *
-   * @param {number} now
+   * @param {number} now Time of the frame, ms.
    */
   isTooSoon(now) {
     const waited = now - Math.max(this.drawnAt, this.app.requests.movedAt);

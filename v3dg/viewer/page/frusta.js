@@ -1,4 +1,5 @@
-// Draws frusta: those of the file's cameras, with their photographs, and that of a frozen cut.
+// Draws frusta: those of the file's cameras with their photographs, and the frustum of
+// a frozen cut.
 
 import * as M from "./math.js";
 
@@ -17,8 +18,8 @@ const FROZEN_DEPTH = 0.08;
 const MOST_THUMBNAILS = 40;
 const THUMBNAIL_OPACITY = 0.85;
 /**
- * Cameras closer than this number of frustum depths are not drawn, because the user looks through
- * them.
+ * Cameras closer than this number of frustum depths are not drawn, because the user is
+ * looking through them.
  */
 const NEAREST_DEPTHS = 0.7;
 /** Largest distance of the pointer from the middle of a frustum, px. */
@@ -46,12 +47,16 @@ export class Frusta {
     return this.app.fileCameras.frustumSize * this.app.camera.radius;
   }
 
-  /** @param {View} view The view for which the frozen cut was selected. */
+  /**
+   * Draws the frustum of a frozen cut.
+   *
+   * @param {View} view The view for which the cut was selected.
+   */
   drawFrozen(view) {
     this.drawFrustum(view, FROZEN_DEPTH * this.app.camera.radius, FROZEN_COLOR, 2);
   }
 
-  /** Draws the frusta of all cameras, the farthest first. */
+  /** Draws the frusta of all cameras, farthest first. */
   draw() {
     const { camera, fileCameras } = this.app;
     const { depth } = this;
@@ -70,7 +75,8 @@ export class Frusta {
   }
 
   /**
-   * Returns the corners of a frustum's far side in order, beginning with the upper left one.
+   * Returns the corners of a frustum's far side in order, beginning with the upper left
+   * one.
    *
    * @param {View} view
    * @param {number} depth
@@ -89,10 +95,12 @@ export class Frusta {
   }
 
   /**
+   * Draws the edges of a frustum.
+   *
    * @param {View} view
    * @param {number} depth
    * @param {string} color
-   * @param {number} width Width of the lines, px.
+   * @param {number} width The width of the lines, px.
    */
   drawFrustum(view, depth, color, width) {
     const corners = this.corners(view, depth);
@@ -112,8 +120,8 @@ export class Frusta {
   }
 
   /**
-   * Returns the index of the camera whose frustum is at a place in the picture; -1 if there is
-   * none.
+   * Returns the index of the camera whose frustum is at a position in the picture, or
+   * -1.
    *
    * @param {number} x
    * @param {number} y
@@ -138,6 +146,8 @@ export class Frusta {
   }
 
   /**
+   * Draws the photograph of a camera on the far side of its frustum.
+   *
    * @param {View} view
    * @param {number} depth
    * @param {number} index
@@ -148,8 +158,8 @@ export class Frusta {
     if (!image.naturalWidth || places.includes(null)) return;
     const [upperLeft, upperRight, lowerRight, lowerLeft] = places;
     const { naturalWidth, naturalHeight } = image;
-    // A photograph is drawn as two triangles, each with the affine map that is exact at its
-    // corners.
+    // The photograph is drawn as two triangles. Each uses the affine map that is exact
+    // at its three corners.
     this.drawHalf(image, [0, 0], 1, [upperLeft, upperRight, lowerLeft]);
     this.drawHalf(image, [naturalWidth, naturalHeight], -1, [lowerRight, lowerLeft, upperRight]);
   }
@@ -158,10 +168,12 @@ export class Frusta {
    * Draws the half of an image that is inside a triangle.
    *
    * @param {HTMLImageElement} image
-   * @param {Place} origin The corner of the image at the first corner of the triangle, px.
-   * @param {1 | -1} sign Sign of the directions of the image's sides from that corner.
-   * @param {Place[]} triangle The corner with the right angle, the end of the horizontal side,
-   *   and the end of the vertical side.
+   * @param {Place} origin The corner of the image at the right angle of the triangle,
+   *   px.
+   * @param {1 | -1} sign The sign of the directions in which the image's sides extend
+   *   from that corner.
+   * @param {Place[]} triangle The corner with the right angle, the end of the
+   *   horizontal side, and the end of the vertical side.
    */
   drawHalf(image, origin, sign, [corner, sideways, downwards]) {
     const { context } = this.projection;
@@ -183,7 +195,7 @@ export class Frusta {
   }
 
   /**
-   * Returns the photograph of a camera, which is loaded on first use.
+   * Returns the small photograph of a camera. It is loaded when it is first needed.
    *
    * @param {number} index
    */

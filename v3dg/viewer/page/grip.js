@@ -8,35 +8,39 @@ import { AXES } from "./camera.js";
 /** @typedef {import("./protocol.js").Pose} Pose */
 
 /**
- * A drag of a handle: along an axis, in the plane of the picture, around an axis, or away from the
- * middle.
+ * The drag of a handle: along an axis, in the plane of the picture, around an axis, or
+ * away from the middle.
  *
  * @typedef {object} Grip
  * @property {"move" | "slide" | "turn" | "size"} kind
- * @property {number} axis Index of the axis; -1 for none.
- * @property {Place} start Where the drag started.
+ * @property {number} axis The index of the axis, or -1.
+ * @property {Place} start The position in the picture at which the drag started.
  * @property {Pose} pose The pose of the instance at the start.
- * @property {Place} middle The place of the instance in the picture at the start.
+ * @property {Place} middle The position of the instance in the picture at the start.
  */
 
 export const WORLD_AXES = [AXES.x, AXES.y, AXES.z];
 const MIN_SCALE = 1e-6;
 const MAX_SCALE = 1e6;
 /**
- * Minimum length of an axis in the picture: a drag along an axis that points to the eye must not
- * move the instance infinitely far.
+ * Minimum length of an axis in the picture. Without it, dragging along an axis that
+ * points to the eye would move the instance infinitely far.
  */
 const LEAST_AXIS_PX = 5;
-/** Minimum distance from the middle: a drag that starts closer than this does not scale faster. */
+/**
+ * Minimum distance from the middle. A drag that starts closer than this does not scale
+ * faster.
+ */
 const LEAST_RADIUS_PX = 5;
 
 /**
- * Returns the pose of an instance when its handle is dragged to a place in the picture.
+ * Returns the pose of an instance when its handle is dragged to a position in the
+ * picture.
  *
  * @param {Grip} grip
  * @param {Place} place
  * @param {Projection} projection
- * @param {number} reach Length of an axis handle in world units.
+ * @param {number} reach The length of an axis handle in world units.
  * @returns {Pose}
  */
 export function draggedPose(grip, place, projection, reach) {
@@ -59,10 +63,12 @@ export function draggedPose(grip, place, projection, reach) {
 }
 
 /**
+ * Returns the pose after a drag along an axis.
+ *
  * @param {Grip} grip
  * @param {Place} place
  * @param {Projection} projection
- * @param {number} reach
+ * @param {number} reach The length of an axis handle in world units.
  */
 function alongAxis({ axis, pose, middle, start }, place, projection, reach) {
   const direction = WORLD_AXES[axis];
@@ -74,6 +80,8 @@ function alongAxis({ axis, pose, middle, start }, place, projection, reach) {
 }
 
 /**
+ * Returns the pose after a drag in the plane of the picture.
+ *
  * @param {Grip} grip
  * @param {Place} place
  * @param {Projection} projection
@@ -87,6 +95,8 @@ function inPlane({ pose, start }, place, projection) {
 }
 
 /**
+ * Returns the pose after a drag around an axis.
+ *
  * @param {Grip} grip
  * @param {Place} place
  * @param {Projection} projection
@@ -99,6 +109,8 @@ function aroundAxis({ axis, pose, middle, start }, place, projection) {
 }
 
 /**
+ * Returns the pose after a drag that scales the instance.
+ *
  * @param {Grip} grip
  * @param {Place} place
  */
@@ -108,6 +120,8 @@ function scaleAt({ pose, middle, start }, place) {
 }
 
 /**
+ * Returns the angle of a position around the middle.
+ *
  * @param {Place} middle
  * @param {Place} place
  */
@@ -117,6 +131,8 @@ function angleAround(middle, place) {
 }
 
 /**
+ * Returns the distance of a position from the middle.
+ *
  * @param {Place} middle
  * @param {Place} place
  */

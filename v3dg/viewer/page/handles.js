@@ -1,4 +1,4 @@
-// The selected instance: its box, and handles that move, rotate and scale it.
+// The selected instance: its box, and the handles that move, rotate and scale it.
 
 import * as M from "./math.js";
 import { AXIS_COLORS } from "./compass.js";
@@ -43,7 +43,7 @@ export class Handles {
   /**
    * Returns the end of the handle along an axis.
    *
-   * @param {number} axis
+   * @param {number} axis The index of the axis.
    */
   tip(axis) {
     return M.add(this.pose.position, M.mul(WORLD_AXES[axis], this.reach));
@@ -52,7 +52,7 @@ export class Handles {
   /**
    * Returns points of the handle around an axis. The last point equals the first.
    *
-   * @param {number} axis
+   * @param {number} axis The index of the axis.
    */
   ring(axis) {
     const { position } = this.pose;
@@ -112,13 +112,17 @@ export class Handles {
     });
   }
 
-  /** @param {number} axis */
+  /**
+   * Returns whether the handle of an axis is being dragged.
+   *
+   * @param {number} axis
+   */
   isGripped(axis) {
     return this.app.instances.grip?.axis === axis;
   }
 
   /**
-   * Returns the handle at a place in the picture; null if there is none.
+   * Returns the handle at a position in the picture, or null.
    *
    * @param {number} x
    * @param {number} y
@@ -144,11 +148,12 @@ export class Handles {
   }
 
   /**
-   * Returns the axis whose handle is nearest to a place in the picture; -1 if none is near.
+   * Returns the axis whose handle is nearest to a position in the picture, or -1 if
+   * none is near.
    *
    * @param {number} x
    * @param {number} y
-   * @param {number} slack
+   * @param {number} slack Largest distance from the handle, px.
    */
   axisAt(x, y, slack) {
     let nearest = slack;
@@ -163,7 +168,11 @@ export class Handles {
     return result;
   }
 
-  /** @param {number} axis */
+  /**
+   * Returns the positions in the picture of the points of an axis's handle.
+   *
+   * @param {number} axis
+   */
   placesOfHandle(axis) {
     const isRing = this.app.instances.tool === "turn";
     const points = isRing ? this.ring(axis) : [this.pose.position, this.tip(axis)];
@@ -171,7 +180,8 @@ export class Handles {
   }
 
   /**
-   * Returns the pose of the instance when its handle is dragged to a place in the picture.
+   * Returns the pose of the instance when its handle is dragged to a position in the
+   * picture.
    *
    * @param {number} x
    * @param {number} y
@@ -191,7 +201,7 @@ export function edgesOf(placed) {
   const corners = cornersOf(placed);
   /** @type {Line[]} */
   const edges = [];
-  // Each bit of a corner's index tells at which end of an axis the corner is.
+  // Each bit of a corner's index tells which end of an axis the corner is at.
   corners.forEach((corner, i) => {
     for (const bit of [1, 2, 4]) {
       if ((i & bit) === 0) edges.push([corner, corners[i | bit]]);
@@ -214,8 +224,11 @@ function cornersOf({ pose, box }) {
 }
 
 /**
+ * Returns the distance of a position from a polyline, px.
+ *
  * @param {Place} place
- * @param {(Place | null)[]} places Points of a polyline; null for points that are not visible.
+ * @param {(Place | null)[]} places The points of the polyline; null for points that are
+ *   not visible.
  */
 function distanceToLines(place, places) {
   let result = Infinity;

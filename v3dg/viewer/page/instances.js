@@ -1,4 +1,4 @@
-// Instances of the scene: picking, selecting, moving, and undoing.
+// The instances of the scene: picking, selecting, moving, and undoing.
 
 import * as M from "./math.js";
 
@@ -8,7 +8,10 @@ import * as M from "./math.js";
 /** @typedef {import("./protocol.js").Picked} Picked */
 /** @typedef {import("./protocol.js").Pose} Pose */
 
-/** Distance between the camera and an instance after a flight to it, in sizes of its box. */
+/**
+ * Distance of the camera from an instance after a flight to it, as a multiple of the
+ * size of its box.
+ */
 const SIZES_AWAY = 1.5;
 
 export class Instances {
@@ -25,18 +28,18 @@ export class Instances {
    */
   tool = "move";
   /**
-   * The handle that is dragged; null if there is none.
+   * The handle that is being dragged; null if there is none.
    *
    * @type {Grip}
    */
   grip = null;
   /**
-   * Poses that `undo` restores, the most recent one last.
+   * Poses that `undo` restores, most recent last.
    *
    * @type {{ instance: number, pose: Pose }[]}
    */
   earlierPoses = [];
-  /** Whether the camera flies to the next picked point. */
+  /** Whether the camera will fly to the next point that is picked. */
   fliesToPicked = false;
 
   /** @param {App} app */
@@ -44,24 +47,25 @@ export class Instances {
     this.app = app;
   }
 
-  /** Forgets selection and poses when another scene is opened. */
+  /** Removes the selection and the stored poses when another scene is opened. */
   reset() {
     this.selected = null;
     this.earlierPoses = [];
   }
 
   /**
-   * Asks for the instance at a place in the picture, to select it and to orbit around the point.
+   * Asks the server for the instance at a position in the picture, to select it and to
+   * orbit around the point.
    *
-   * @param {number} x Position as a fraction of the width.
-   * @param {number} y Position as a fraction of the height.
+   * @param {number} x The position as a fraction of the width.
+   * @param {number} y The position as a fraction of the height.
    */
   pick(x, y) {
     this.sendPick(x, y, false);
   }
 
   /**
-   * Picks like `pick`, and flies to the point.
+   * Like `pick`, but also flies to the point.
    *
    * @param {number} x
    * @param {number} y
@@ -71,9 +75,11 @@ export class Instances {
   }
 
   /**
+   * Sends the request to pick.
+   *
    * @param {number} x
    * @param {number} y
-   * @param {boolean} flies
+   * @param {boolean} flies Whether the camera then flies to the point.
    */
   sendPick(x, y, flies) {
     const { app } = this;
@@ -84,16 +90,20 @@ export class Instances {
   }
 
   /**
-   * Flies to an instance by its number.
+   * Flies to an instance.
    *
-   * @param {number} instance
+   * @param {number} instance The number of the instance.
    */
   flyTo(instance) {
     this.fliesToPicked = true;
     this.app.connection.send({ type: "pick", look: this.app.look.message, instance });
   }
 
-  /** @param {Picked} picked The answer of the server. */
+  /**
+   * Handles the answer to a request to pick.
+   *
+   * @param {Picked} picked The answer of the server.
+   */
   take(picked) {
     if (picked.instance === undefined) {
       this.select(null);
@@ -114,14 +124,19 @@ export class Instances {
     this.app.redraw();
   }
 
-  /** @param {Picked | null} picked */
+  /**
+   * Selects an instance; null deselects it.
+   *
+   * @param {Picked | null} picked
+   */
   select(picked) {
     this.selected = picked;
     this.app.sync();
   }
 
   /**
-   * Flies to the selected instance; if there is none, to the point around which the camera orbits.
+   * Flies to the selected instance. If there is none, flies to the point that the
+   * camera orbits.
    */
   flyToSelected() {
     const { camera } = this.app;
@@ -133,7 +148,11 @@ export class Instances {
     this.app.redraw();
   }
 
-  /** @param {Tool} tool */
+  /**
+   * Selects which handles are shown.
+   *
+   * @param {Tool} tool
+   */
   setTool(tool) {
     this.tool = tool;
     this.app.sync();
@@ -150,6 +169,8 @@ export class Instances {
   }
 
   /**
+   * Sends the pose of an instance to the server.
+   *
    * @param {number} instance
    * @param {Pose} pose
    */
@@ -160,7 +181,7 @@ export class Instances {
     app.redraw();
   }
 
-  /** Ends the drag of a handle, and records its start for undoing. */
+  /** Ends the drag of a handle, and stores the earlier pose for `undo`. */
   letGo() {
     this.earlierPoses.push({ instance: this.selected.instance, pose: this.grip.pose });
     this.grip = null;

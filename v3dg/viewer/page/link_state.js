@@ -1,4 +1,5 @@
-// The part of the page's address after `#`: the camera and the settings.
+// The part of the web page's address after `#`, which contains the camera and the
+// settings.
 
 import * as M from "./math.js";
 import { colorOf, hexOf } from "./colors.js";
@@ -11,10 +12,10 @@ import { AXES, MODES, SPEED_BOUNDS, isMode } from "./camera.js";
 /** @typedef {import("./protocol.js").Shows} Shows */
 /** @typedef {Record<string, string | number>} Parts */
 
-/** Field of view in degrees. */
+/** Limits of the field of view in degrees. */
 const FOV_BOUNDS = [1, 170];
 const RESOLUTION_BOUNDS = [0.1, 1];
-/** Values that a link need not contain, in addition to the defaults of the settings. */
+/** Usual values, which a link omits. The settings have further defaults. */
 const USUAL = { mode: MODES[0], speed: 1, resolution: 1 };
 
 export class LinkState {
@@ -26,7 +27,10 @@ export class LinkState {
     });
   }
 
-  /** A link to the current view, from `#` on, without values that are defaults. */
+  /**
+   * A link to the current view, beginning with `#`. It does not contain values that are
+   * defaults.
+   */
   get hash() {
     const { camera, look, places, greeting } = this.app;
     /** @type {Parts} */
@@ -43,12 +47,12 @@ export class LinkState {
     };
     /** @type {Parts} */
     const usual = { ...USUAL, ...partsOf(greeting.defaults) };
-    delete usual.tolerance; // always part of a link
+    delete usual.tolerance; // always included in the link
     const said = Object.entries(parts).filter(([name, value]) => usual[name] !== value);
     return `#${said.map(([name, value]) => `${name}=${value}`).join("&")}`;
   }
 
-  /** Updates the address of the page to the current view. */
+  /** Updates the address of the web page to the current view. */
   write() {
     history.replaceState(null, "", this.hash);
   }
@@ -60,16 +64,16 @@ export class LinkState {
       await navigator.clipboard.writeText(url);
       this.app.status.confirm("The link was copied to the clipboard.");
     } catch {
-      // Browsers do not allow unencrypted pages to use the clipboard.
+      // Browsers do not allow web pages without encryption to use the clipboard.
       this.app.status.confirm("The link is in the address bar.");
     }
   }
 
   /**
-   * Applies a link. Values that are missing or invalid are not changed.
+   * Applies a link. If a value is missing or invalid, the current one is kept.
    *
    * @param {string} hash
-   * @param {"jump" | "fly"} manner
+   * @param {"jump" | "fly"} manner How the camera moves to the view.
    */
   open(hash, manner = "jump") {
     const values = new LinkValues(hash);
@@ -85,8 +89,10 @@ export class LinkState {
   }
 
   /**
+   * Applies the view of a link.
+   *
    * @param {LinkValues} values
-   * @param {"jump" | "fly"} manner
+   * @param {"jump" | "fly"} manner How the camera moves to the view.
    */
   openView(values, manner) {
     const { camera } = this.app;
@@ -105,7 +111,11 @@ export class LinkState {
     camera.focus = focus ?? camera.focus;
   }
 
-  /** @param {LinkValues} values */
+  /**
+   * Applies the settings of a link.
+   *
+   * @param {LinkValues} values
+   */
   openSettings(values) {
     const { settings } = this.app.look;
     const { defaults, limits } = this.app.greeting;
@@ -128,7 +138,8 @@ export class LinkState {
   }
 
   /**
-   * Returns the mode in a link; null if it is missing, or if the scene does not support it.
+   * Returns the mode in a link. Returns null if there is none, or if the scene does not
+   * support it.
    *
    * @param {LinkValues} values
    * @returns {Shows | null}
@@ -146,23 +157,27 @@ export class LinkState {
   }
 }
 
-/** The values in a link by name; null for a value that is missing or invalid. */
+/** The values in a link, by name. A value that is missing or invalid is null. */
 class LinkValues {
   /** @param {string} hash */
   constructor(hash) {
     this.values = new URLSearchParams(hash.replace(/^#/, ""));
   }
 
-  /** @param {string} name */
+  /**
+   * Returns a value as text.
+   *
+   * @param {string} name
+   */
   text(name) {
     return this.values.get(name);
   }
 
   /**
-   * Returns a number, clamped to bounds.
+   * Returns a value as a number.
    *
    * @param {string} name
-   * @param {number[]} bounds
+   * @param {number[]} bounds The limits to which it is clamped.
    */
   number(name, [low, high]) {
     const text = this.text(name);
@@ -172,17 +187,19 @@ class LinkValues {
   }
 
   /**
-   * Returns a given count of numbers that are separated by commas.
+   * Returns a value as numbers that are separated by commas.
    *
    * @param {string} name
-   * @param {number} count
+   * @param {number} count The required number of them.
    */
   numbers(name, count) {
     const values = M.numbersOf(this.text(name) ?? "");
     return values.length === count && values.every(Number.isFinite) ? values : null;
   }
 
-  /** Returns the up direction, which is the name of an axis or three numbers. */
+  /**
+   * Returns the up direction. A link contains the name of an axis, or three numbers.
+   */
   up() {
     const name = this.text("up");
     if (Object.hasOwn(AXES, name)) return AXES[/** @type {keyof AXES} */ (name)];
@@ -191,7 +208,7 @@ class LinkValues {
 }
 
 /**
- * Returns settings in the form of a link.
+ * Returns the settings in the form in which links contain them.
  *
  * @param {Settings} settings
  * @returns {Parts}
@@ -209,7 +226,11 @@ function partsOf(settings) {
   };
 }
 
-/** @param {number[]} values */
+/**
+ * Returns numbers as text, separated by commas.
+ *
+ * @param {number[]} values
+ */
 function textOf(values) {
   return values.map((value) => Number(value.toPrecision(7))).join(",");
 }

@@ -1,17 +1,17 @@
-// The request for a picture: the camera's view, the size of the picture, and the settings.
+// The request for a picture: the camera's view, the size of the picture, and the
+// settings.
 
 /** @typedef {import("./camera.js").Camera} Camera */
 /** @typedef {import("./protocol.js").Look} LookMessage */
 /** @typedef {import("./protocol.js").Settings} Settings */
 /** @typedef {import("./protocol.js").Hello} Hello */
 
-/** Maximum number of picture px for each px of the page. */
+/** Maximum number of picture px for each px of the web page. */
 const MOST_PIXEL_RATIO = 2;
 
 export class Look {
   /**
-   * The content and the quality of the picture; null until the server has sent the initial
-   * settings.
+   * The settings of the picture; null until the server has sent their initial values.
    *
    * @type {Settings}
    */
@@ -30,13 +30,17 @@ export class Look {
     this.camera = camera;
   }
 
-  /** @param {Hello} hello */
+  /**
+   * Takes the initial settings from the first message of the server.
+   *
+   * @param {Hello} hello
+   */
   begin(hello) {
     this.settings = structuredClone(hello.settings);
     this.mostPixels = hello.limits.picture_px;
   }
 
-  /** Width divided by height. */
+  /** The width of the picture divided by its height. */
   get aspect() {
     return this.stage.clientWidth / this.stage.clientHeight;
   }
@@ -56,7 +60,11 @@ export class Look {
     return /** @type {[number, number]} */ ([side(width), side(height)]);
   }
 
-  /** @returns {LookMessage} */
+  /**
+   * The message that requests a picture.
+   *
+   * @returns {LookMessage}
+   */
   get message() {
     return { type: "look", view: this.view, size: this.size, settings: this.settings };
   }

@@ -1,6 +1,6 @@
-// Starts the viewer's page.
+// Starts the viewer's web page.
 
 import { App } from "./app.js";
 
-/** Public for tests and for programs that take screenshots of the page. */
+/** The app is public for tests, and for programs that take screenshots. */
 window.viewer = new App();

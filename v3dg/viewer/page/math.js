@@ -58,14 +58,15 @@ export function cross(a, b) {
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
-/** @param {number[]} a */
+/**
+ * @param {number[]} a
+ */
 export function length(a) {
   return Math.hypot(...a);
 }
 
 /**
- * Returns a vector of the same direction with length one; the zero vector stays zero.
- *
+ * Returns a vector of the same direction with length 1. The zero vector is not changed.
  * @template {number[]} V
  * @param {V} a
  */
@@ -75,7 +76,6 @@ export function unit(a) {
 
 /**
  * Interpolates linearly from `a` (t = 0) to `b` (t = 1).
- *
  * @template {number[]} V
  * @param {V} a
  * @param {V} b
@@ -86,6 +86,7 @@ export function mix(a, b, t) {
 }
 
 /**
+ * Returns the number in [low, high] that is closest to x.
  * @param {number} x
  * @param {number} low
  * @param {number} high
@@ -95,6 +96,7 @@ export function clamp(x, low, high) {
 }
 
 /**
+ * Returns whether no component differs by more than `difference`.
  * @param {number[]} a
  * @param {number[]} b
  * @param {number} difference
@@ -103,19 +105,23 @@ export function isNear(a, b, difference) {
   return a.every((x, i) => Math.abs(x - b[i]) <= difference);
 }
 
-/** @param {number} angle Radians. */
+/**
+ * @param {number} angle In radians.
+ */
 export function degrees(angle) {
   return (angle * 180) / Math.PI;
 }
 
-/** @param {number} angle Degrees. */
+/**
+ * @param {number} angle In degrees.
+ */
 export function radians(angle) {
   return (angle * Math.PI) / 180;
 }
 
 /**
- * Returns the numbers in a text, which are separated by spaces or commas; NaN for other words.
- *
+ * Returns the numbers in a text. They are separated by spaces or commas. A word that is
+ * not a number gives NaN.
  * @param {string} text
  */
 export function numbersOf(text) {
@@ -126,8 +132,7 @@ export function numbersOf(text) {
 }
 
 /**
- * Returns a world axis that is not parallel to a direction of length one.
- *
+ * Returns a world axis that is not parallel to a direction of length 1.
  * @param {Vector} direction
  * @returns {Vector}
  */
@@ -138,7 +143,6 @@ export function axisAcross(direction) {
 
 /**
  * Returns the rotation by `b`, followed by the rotation by `a`.
- *
  * @param {Quaternion} a
  * @param {Quaternion} b
  * @returns {Quaternion}
@@ -153,8 +157,9 @@ export function product(a, b) {
 }
 
 /**
+ * Returns the rotation about an axis of length 1.
  * @param {Vector} axis
- * @param {number} angle Radians.
+ * @param {number} angle In radians.
  * @returns {Quaternion}
  */
 export function about(axis, angle) {
@@ -162,6 +167,7 @@ export function about(axis, angle) {
 }
 
 /**
+ * Returns the inverse of a rotation.
  * @param {Quaternion} q
  * @returns {Quaternion}
  */
@@ -170,6 +176,7 @@ export function inverse(q) {
 }
 
 /**
+ * Returns the vector after a rotation.
  * @param {Quaternion} q
  * @param {Vector} v
  * @returns {Vector}
@@ -181,7 +188,6 @@ export function rotate(q, v) {
 
 /**
  * Interpolates from `a` (t = 0) to `b` (t = 1) along the shorter arc.
- *
  * @param {Quaternion} a
  * @param {Quaternion} b
  * @param {number} t
@@ -198,8 +204,7 @@ export function slerp(a, b, t) {
 }
 
 /**
- * Returns the rotation whose columns are three right-handed axes of length one.
- *
+ * Returns the rotation whose matrix has three right-handed axes of length 1 as columns.
  * @param {Vector} x
  * @param {Vector} y
  * @param {Vector} z
@@ -221,9 +226,8 @@ export function fromAxes(x, y, z) {
 }
 
 /**
- * Returns the rotation from camera (x right, y down, z forward) to world for a camera that looks
- * along `forward`.
- *
+ * Returns the rotation from the camera's axes (x right, y down, z forward) to the
+ * world, for a camera that looks along `forward`.
  * @param {Vector} forward
  * @param {Vector} up
  */
@@ -236,23 +240,22 @@ export function looking(forward, up) {
 }
 
 /**
- * Returns the homography that shows a picture of one view from another view. It is exact for points
- * on a plane at a distance from the first view.
- *
+ * Returns the homography that shows a picture of one view as seen from another. It is
+ * exact for points on a plane at a given distance from the first view.
  * @param {Pinhole} before
  * @param {Pinhole} now
  * @param {number} distance
- * @param {number} width Width of the element, px.
+ * @param {number} width The width of the element, px.
  * @param {number} height
- * @returns {string | null} The CSS transform of an element whose origin is its upper left
- *   corner; null if the middle of the picture is behind the other view.
+ * @returns {string | null} The CSS transform of an element whose origin is its upper
+ *   left corner. It is null if the middle of the picture is behind the other view.
  */
 export function warp(before, now, distance, width, height) {
   const oldAxes = IDENTITY.map((axis) => rotate(before.wxyz, axis));
   const newAxes = IDENTITY.map((axis) => rotate(now.wxyz, axis));
   const step = sub(before.position, now.position);
   let shift = newAxes.map((axis) => dot(axis, step) / distance);
-  // A plane is a bad approximation for near objects, so the shift is limited.
+  // For near objects, a plane is a bad approximation, so the shift is limited.
   if (length(shift) > MOST_SHIFT) shift = mul(shift, MOST_SHIFT / length(shift));
   const turn = /** @type {Matrix} */ (
     newAxes.map((axis) => oldAxes.map((oldAxis) => dot(axis, oldAxis)))
@@ -285,7 +288,10 @@ function times(a, b) {
   );
 }
 
-/** @param {Matrix} homography */
+/**
+ * Returns a homography as text for CSS.
+ * @param {Matrix} homography
+ */
 function cssTransform([x, y, w]) {
   if (w[2] <= 0.05) return null;
   const columns = [x[0], y[0], 0, w[0], x[1], y[1], 0, w[1], 0, 0, 1, 0, x[2], y[2], 0, w[2]];

@@ -28,9 +28,9 @@ const PUSHES = {
 };
 const FAST = 4;
 const SLOW = 0.25;
-/** Values of a gamepad's stick below this count as zero. */
+/** A gamepad's stick counts as released if its value is below this. */
 const DEAD_ZONE = 0.14;
-/** Turning speed in radians per second, for a stick that is pushed completely. */
+/** Turning speed, in radians per second, for a stick that is pushed completely. */
 const YAW_SPEED = 1.8;
 const PITCH_SPEED = 1.4;
 /** Buttons of a standard gamepad. */
@@ -38,7 +38,10 @@ const LEFT_SHOULDER = 4;
 const RIGHT_SHOULDER = 5;
 const LEFT_TRIGGER = 6;
 const RIGHT_TRIGGER = 7;
-/** The pad on the screen, px: half its width, the reach of a finger, and the knob. */
+/**
+ * Measures of the pad on the screen, px: half its width, the reach of a finger, and the
+ * knob.
+ */
 const PAD_CENTER = 55;
 const PAD_REACH = 45;
 const KNOB_REACH = 35;
@@ -55,7 +58,7 @@ export class Movement {
   /** Whether Alt is held. */
   isSlow = false;
   /**
-   * Movement of the pad on the screen, to the right and down.
+   * Position of the pad on the screen, to the right and down.
    *
    * @type {[number, number]}
    */
@@ -72,7 +75,11 @@ export class Movement {
     this.listenToPad();
   }
 
-  /** @param {KeyboardEvent} event */
+  /**
+   * Handles a key that is pressed.
+   *
+   * @param {KeyboardEvent} event
+   */
   press(event) {
     this.noteModifiers(event);
     if (isTyping(event)) return;
@@ -86,7 +93,11 @@ export class Movement {
     }
   }
 
-  /** @param {KeyboardEvent} event */
+  /**
+   * Handles a key that is released.
+   *
+   * @param {KeyboardEvent} event
+   */
   release(event) {
     this.noteModifiers(event);
     this.keys.delete(event.code);
@@ -95,7 +106,11 @@ export class Movement {
     this.app.redraw();
   }
 
-  /** @param {KeyboardEvent} event */
+  /**
+   * Stores whether Shift and Alt are held.
+   *
+   * @param {KeyboardEvent} event
+   */
   noteModifiers(event) {
     this.isFast = event.shiftKey;
     this.isSlow = event.altKey;
@@ -115,7 +130,11 @@ export class Movement {
     }
   }
 
-  /** @param {PointerEvent} event */
+  /**
+   * Moves the pad on the screen to the pointer.
+   *
+   * @param {PointerEvent} event
+   */
   followPad(event) {
     const box = this.pad.getBoundingClientRect();
     const x = event.clientX - box.left - PAD_CENTER;
@@ -124,6 +143,8 @@ export class Movement {
   }
 
   /**
+   * Sets the position of the pad on the screen, to the right and down.
+   *
    * @param {number} x
    * @param {number} y
    */
@@ -137,7 +158,7 @@ export class Movement {
   }
 
   /**
-   * Moves the camera during some time; returns whether it is moving.
+   * Moves the camera for some time. Returns whether it is moving.
    *
    * @param {number} seconds
    */
@@ -170,13 +191,17 @@ export class Movement {
   }
 }
 
-/** @param {KeyboardEvent} event */
+/**
+ * Returns whether a key moves the camera.
+ *
+ * @param {KeyboardEvent} event
+ */
 function isPush(event) {
   return Object.hasOwn(PUSHES, event.code) && !event.ctrlKey && !event.metaKey;
 }
 
 /**
- * Whether a key is meant for a control of the panel for typing or choosing.
+ * Returns whether a key is meant for a control in which the user types or chooses.
  *
  * @param {KeyboardEvent} event
  */
@@ -186,7 +211,7 @@ function isTyping({ target }) {
 }
 
 /**
- * Whether an arrow key is meant for a control of the panel.
+ * Returns whether an arrow key is meant for a control of the panel.
  *
  * @param {KeyboardEvent} event
  */
@@ -202,7 +227,11 @@ function connectedGamepads() {
   );
 }
 
-/** @param {number} value Value of a stick's axis, -1 to 1. */
+/**
+ * Returns a stick's value without its dead zone.
+ *
+ * @param {number} value Value of an axis, -1 to 1.
+ */
 function withoutDeadZone(value) {
   if (Math.abs(value) < DEAD_ZONE) return 0;
   return (value - DEAD_ZONE * Math.sign(value)) / (1 - DEAD_ZONE);

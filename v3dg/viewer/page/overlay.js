@@ -1,4 +1,5 @@
-// Draws over the picture: frusta, the selected instance, the box of a crop, and the axes.
+// Draws over the picture: frusta, the selected instance, the box of a crop, and the
+// axes.
 
 import { Compass } from "./compass.js";
 import { Crop } from "./crop.js";
@@ -27,8 +28,10 @@ export class Overlay {
   }
 
   /**
-   * @param {number} width Px of the page.
-   * @param {number} height
+   * Adapts the canvas to the window.
+   *
+   * @param {number} width The width in px of the web page.
+   * @param {number} height The height in px of the web page.
    */
   resize(width, height) {
     const ratio = window.devicePixelRatio || 1;
@@ -46,11 +49,13 @@ export class Overlay {
     const { frozen } = app.look.settings;
     const hasObject = app.instances.selected || this.crop.isOn;
     const isEmpty = !frozen && !app.fileCameras.showsFrusta && !hasObject;
-    // An empty layer is made transparent, because blending it takes long without a GPU.
+    // If nothing is drawn, the layer is made transparent, because blending it takes
+    // long without a GPU.
     this.canvas.style.opacity = isEmpty ? "0" : "1";
     if (isEmpty) return;
     context.clearRect(0, 0, projection.width, projection.height);
-    // Browsers may not show a frame that was only cleared.
+    // Browsers may not show a frame that was only cleared, so fill it with an invisible
+    // colour.
     context.fillStyle = "#00000003";
     context.fillRect(0, 0, 1, 1);
     if (frozen) this.frusta.drawFrozen(frozen);

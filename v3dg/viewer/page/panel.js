@@ -36,7 +36,7 @@ export class Panel {
   root = element("panel");
   figures = make("div");
   /**
-   * All folders with controls; empty until a scene is shown.
+   * All folders with controls. There are none until a scene is shown.
    *
    * @type {Folder[]}
    */
@@ -51,7 +51,7 @@ export class Panel {
     this.app = app;
   }
 
-  /** Rebuilds the panel for a scene. */
+  /** Creates the panel anew for a scene. */
   build() {
     const { app } = this;
     this.figures.replaceChildren();
@@ -71,14 +71,22 @@ export class Panel {
     this.sync();
   }
 
-  /** @param {string} title */
+  /**
+   * Adds a closed folder.
+   *
+   * @param {string} title
+   */
   addFolder(title) {
     const folder = make("details", {}, make("summary", {}, title));
     this.root.append(folder);
     return folder;
   }
 
-  /** @param {string} title */
+  /**
+   * Adds an open folder.
+   *
+   * @param {string} title
+   */
   addOpenFolder(title) {
     const folder = this.addFolder(title);
     folder.open = true;
@@ -90,7 +98,11 @@ export class Panel {
     for (const folder of this.folders) folder.sync();
   }
 
-  /** @param {Picture} picture */
+  /**
+   * Shows the statistics of a picture.
+   *
+   * @param {Picture} picture
+   */
   showFigures(picture) {
     this.figures.replaceChildren(...figuresOf(picture, this.app.scene));
   }
@@ -99,12 +111,20 @@ export class Panel {
     this.movement.showPace();
   }
 
-  /** @param {boolean} isRecording */
+  /**
+   * Shows whether a path is being recorded.
+   *
+   * @param {boolean} isRecording
+   */
   showRecording(isRecording) {
     this.path.recording.set(isRecording);
   }
 
-  /** @param {number} share Fraction of the work that is done, 0 to 1. */
+  /**
+   * Shows the progress of saving.
+   *
+   * @param {number} share The fraction of the work that is done, 0 to 1.
+   */
   showProgress(share) {
     this.path.progress.hidden = false;
     this.path.progress.value = share;

@@ -8,7 +8,7 @@ import { degrees, radians } from "./math.js";
 /** @typedef {import("./page.js").Axis} Axis */
 
 const UP_AXES = ["z", "y", "x", "-z", "-y", "-x"];
-/** The option for an up direction that is not an axis. Choosing it changes nothing. */
+/** The option for an up direction that is not an axis. Choosing it has no effect. */
 const OTHER = "other";
 
 export class MovementFolder {
@@ -41,7 +41,11 @@ export class MovementFolder {
     this.pace.textContent = `${pace} units a second; the scene's radius is ${radius}`;
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider of the speed.
+   *
+   * @param {HTMLElement} parent
+   */
   addSpeed(parent) {
     const range = {
       low: 0.02,
@@ -57,7 +61,11 @@ export class MovementFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider of the field of view.
+   *
+   * @param {HTMLElement} parent
+   */
   addFieldOfView(parent) {
     const range = {
       low: 10,
@@ -72,7 +80,11 @@ export class MovementFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the list of up axes.
+   *
+   * @param {HTMLElement} parent
+   */
   addUp(parent) {
     const state = {
       options: [...UP_AXES, OTHER].map((axis) => [axis, axis]),
@@ -142,7 +154,11 @@ export class FileCamerasFolder {
     this.frusta.set(this.app.fileCameras.showsFrusta);
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the list of cameras.
+   *
+   * @param {HTMLElement} parent
+   */
   addCameras(parent) {
     const { fileCameras } = this.app;
     const names = fileCameras.list.map(({ name }, i) => [String(i), name]);
@@ -152,7 +168,11 @@ export class FileCamerasFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the checkbox that shows frusta.
+   *
+   * @param {HTMLElement} parent
+   */
   addFrusta(parent) {
     const { fileCameras } = this.app;
     const state = {
@@ -164,7 +184,11 @@ export class FileCamerasFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider of the size of frusta.
+   *
+   * @param {HTMLElement} parent
+   */
   addFrustumSize(parent) {
     const { fileCameras } = this.app;
     const value = fileCameras.frustumSize;
@@ -174,7 +198,11 @@ export class FileCamerasFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider of the opacity of photographs.
+   *
+   * @param {HTMLElement} parent
+   */
   addOpacity(parent) {
     const { fileCameras } = this.app;
     const range = { low: 0, high: 100, step: 5, value: 100 * fileCameras.opacity };

@@ -1,4 +1,5 @@
-// The panel's folder for cropping an asset by a box, and saving the part as a new asset.
+// The panel's folder for cropping an asset by a box, and saving the part as a new
+// asset.
 
 import * as controls from "./controls.js";
 import { make } from "./elements.js";

@@ -1,4 +1,4 @@
-// The panel's folder "Picture": the content and the quality of pictures.
+// The panel's folder "Picture", about the content and the quality of pictures.
 
 import { colorOf, hexOf } from "./colors.js";
 import { addButton, addCheckbox, addColor, addRow, addSelect, addSlider } from "./controls.js";
@@ -19,13 +19,13 @@ const NAMES = /** @type {Record<Shows, string>} */ ({
   count: "Gaussians per pixel",
   difference: "Difference to all gaussians",
 });
-/** Modes that are useful only if there are levels. */
+/** Modes that are only useful if there are levels. */
 const OF_LEVELS = /** @type {Shows[]} */ (["level", "error", "difference"]);
-/** Ends of the sliders, unless a setting is beyond them. */
+/** Ends of the sliders. A slider is longer if its setting is larger. */
 const MOST_TOLERANCE = 32;
 const LEAST_MILLIONS = 0.01;
 const MOST_MILLIONS = 20;
-/** Number of millions of gaussians when the limit is switched on. */
+/** The limit, in millions of gaussians, when it is switched on. */
 const FIRST_MILLIONS = 2;
 
 export class PictureFolder {
@@ -76,7 +76,11 @@ export class PictureFolder {
     this.background.set(hexOf(settings.background));
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the colour of the background.
+   *
+   * @param {HTMLElement} parent
+   */
   addBackground(parent) {
     const title = "The colour behind the gaussians.";
     const state = { value: hexOf(this.settings.background), title };
@@ -86,6 +90,8 @@ export class PictureFolder {
   }
 
   /**
+   * Adds the list of display modes.
+   *
    * @param {HTMLElement} parent
    * @param {boolean} hasLevels
    */
@@ -100,14 +106,22 @@ export class PictureFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider that amplifies differences.
+   *
+   * @param {HTMLElement} parent
+   */
   addGain(parent) {
     const [low, high] = this.app.limits.gain;
     const range = { low, high, step: 1, value: this.settings.gain };
     return addSlider(parent, "Amplify", range, (gain) => this.app.change({ gain }));
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider of the tolerance.
+   *
+   * @param {HTMLElement} parent
+   */
   addTolerance(parent) {
     const value = this.settings.tolerance;
     const title =
@@ -116,7 +130,11 @@ export class PictureFolder {
     return addSlider(parent, "Tolerance px²", range, (tolerance) => this.app.change({ tolerance }));
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the checkbox that limits the number of gaussians.
+   *
+   * @param {HTMLElement} parent
+   */
   addLimit(parent) {
     const title = "Raise the tolerance until at most this number of gaussians is selected.";
     const state = { value: this.settings.budget !== null, title };
@@ -127,14 +145,18 @@ export class PictureFolder {
   }
 
   /**
-   * With a limit, the tolerance is usually 0, which would draw all gaussians when the limit is
-   * removed.
+   * The tolerance after the limit is removed. With a limit, it is usually 0, which
+   * would draw all gaussians.
    */
   get toleranceWithoutLimit() {
     return this.settings.tolerance || this.app.greeting.defaults.tolerance;
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider of the limit.
+   *
+   * @param {HTMLElement} parent
+   */
   addBudget(parent) {
     const { budget } = this.settings;
     const value = budget === null ? FIRST_MILLIONS : budget / 1e6;
@@ -150,6 +172,8 @@ export class PictureFolder {
   }
 
   /**
+   * Adds the slider of the finest level.
+   *
    * @param {HTMLElement} parent
    * @param {number} numLevels
    */
@@ -161,7 +185,11 @@ export class PictureFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the checkbox of the fade.
+   *
+   * @param {HTMLElement} parent
+   */
   addFade(parent) {
     const title = "Blend between levels, so that nothing pops while the camera moves.";
     const state = { value: this.settings.fade !== null, title };
@@ -170,14 +198,22 @@ export class PictureFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the checkbox that compares with the full asset.
+   *
+   * @param {HTMLElement} parent
+   */
   addSplit(parent) {
     const title = "Show all gaussians on the left and the cut on the right.";
     const range = { low: 0, high: 1, step: 0.01, value: this.settings.split, title };
     return addSlider(parent, "Split", range, (split) => this.app.change({ split }));
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the checkbox that freezes the cut.
+   *
+   * @param {HTMLElement} parent
+   */
   addFreeze(parent) {
     const title = "Keep the cut of this camera while you fly around.";
     const state = { value: this.settings.frozen !== null, title };
@@ -186,7 +222,11 @@ export class PictureFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the slider of the resolution.
+   *
+   * @param {HTMLElement} parent
+   */
   addResolution(parent) {
     const { look } = this.app;
     const title =

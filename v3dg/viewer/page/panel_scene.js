@@ -74,7 +74,11 @@ export class PathFolder {
     if (stops.length) this.text.textContent = `${stops.length} views, ${duration.toFixed(1)} s`;
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the buttons that record a path.
+   *
+   * @param {HTMLElement} parent
+   */
   addRecording(parent) {
     const { path } = this.app;
     const state = { value: false, title: "Record every view while you fly." };
@@ -84,7 +88,11 @@ export class PathFolder {
     });
   }
 
-  /** @param {HTMLElement} parent */
+  /**
+   * Adds the list of film sizes.
+   *
+   * @param {HTMLElement} parent
+   */
   addFilmSize(parent) {
     const { path } = this.app;
     const sizes = ["1280 x 720", "1920 x 1080", AS_THE_WINDOW];
@@ -95,7 +103,11 @@ export class PathFolder {
   }
 }
 
-/** @param {number} value */
+/**
+ * Rounds a number to four digits.
+ *
+ * @param {number} value
+ */
 function fourDigits(value) {
   return Number(value.toPrecision(4));
 }

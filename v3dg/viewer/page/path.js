@@ -1,4 +1,4 @@
-// A path of the camera: views that are added or recorded, played, and saved.
+// A path of the camera. Its views are added or recorded, and can be played and saved.
 
 import * as M from "./math.js";
 
@@ -11,8 +11,8 @@ const RECORDED_A_SECOND = 30;
 /** Minimum time between two views, because the viewer does not accept equal times. */
 const LEAST_SECONDS = 0.01;
 /**
- * Name of the size of a film that equals the size of the window. All other names are like "1280 x
- * 720".
+ * The name of the film size that equals the size of the window. All other names are
+ * like "1280 x 720".
  */
 export const AS_THE_WINDOW = "as the window";
 
@@ -21,7 +21,7 @@ export class CameraPath {
    * Views, each with the seconds since the previous view.
    */
   stops = [];
-  /** Seconds between the last view and the one that is added next. */
+  /** Seconds between the last view and the next one that is added. */
   secondsOfNextStop = 2;
   /** Width and height of films, px, or `AS_THE_WINDOW`. */
   filmSize = "1280 x 720";
@@ -33,8 +33,8 @@ export class CameraPath {
    */
   recordedAt = null;
   /**
-   * The views that are played, and the time at which playback started, ms; null if nothing is
-   * played.
+   * The views that are being played, and the time at which playback started, ms; null
+   * if nothing is played.
    *
    * @type {Play & { start: number }}
    */
@@ -72,7 +72,7 @@ export class CameraPath {
     this.app.sync();
   }
 
-  /** Starts recording views, after removing the previous path. */
+  /** Removes the path, and starts recording views. */
   startRecording() {
     this.stops = [];
     this.recordedAt = null;
@@ -81,19 +81,27 @@ export class CameraPath {
   }
 
   stopRecording() {
-    this.record(performance.now()); // the path ends with the present view
+    this.record(performance.now()); // the path ends with the current view
     this.isRecording = false;
     this.app.sync();
   }
 
-  /** @param {number} now Time of a frame, ms. */
+  /**
+   * Records a view if enough time has passed.
+   *
+   * @param {number} now Time of a frame, ms.
+   */
   recordFrame(now) {
     if (!this.isRecording) return;
     const isFirst = this.recordedAt === null;
     if (isFirst || now - this.recordedAt >= 1000 / RECORDED_A_SECOND) this.record(now);
   }
 
-  /** @param {number} now */
+  /**
+   * Records a view.
+   *
+   * @param {number} now Time of the view, ms.
+   */
   record(now) {
     const { app } = this;
     const last = this.stops.at(-1);
@@ -107,18 +115,27 @@ export class CameraPath {
     this.recordedAt = now;
   }
 
-  /** @param {Play} message */
+  /**
+   * Starts playback of the path.
+   *
+   * @param {Play} message
+   */
   play(message) {
     this.film = { ...message, start: performance.now() };
     this.app.redraw();
   }
 
-  /** @param {number} now Time of a frame, ms. */
+  /**
+   * Moves the camera along the path that is played.
+   *
+   * @param {number} now Time of a frame, ms.
+   */
   playFrame(now) {
     if (!this.film) return;
     const { views, fps, start } = this.film;
     const end = views.length - 1;
-    // The time of a frame may be slightly before the arrival of the message.
+    // The time of the frame may be slightly before the arrival of the message, so it is
+    // clamped.
     const place = M.clamp(((now - start) / 1000) * fps, 0, end);
     this.app.camera.put(views[Math.floor(place)]);
     if (place >= end) this.film = null;
@@ -131,7 +148,8 @@ export class CameraPath {
   }
 
   /**
-   * Requests a file of the picture, the scene or the path, or the views of the path for playback.
+   * Requests a file of the picture, the scene or the path, or the views of the path for
+   * playback.
    *
    * @param {Save["what"]} what
    */
@@ -151,7 +169,11 @@ export class CameraPath {
   }
 }
 
-/** @param {[number, View][]} stops */
+/**
+ * Returns the seconds from the first to the last view.
+ *
+ * @param {[number, View][]} stops
+ */
 function sumOfSeconds(stops) {
   return stops.reduce((sum, [seconds]) => sum + seconds, 0);
 }

@@ -1,4 +1,5 @@
-// The last picture. It is transformed to follow the camera until the next picture arrives.
+// The last picture. Until the next picture arrives, it is transformed to follow the
+// camera.
 
 import * as M from "./math.js";
 import { element } from "./elements.js";
@@ -6,7 +7,7 @@ import { element } from "./elements.js";
 /** @typedef {import("./app.js").App} App */
 /** @typedef {import("./protocol.js").Picture} PictureMessage */
 
-/** Minimum time between two updates of the statistics for drafts. */
+/** Minimum time between two updates of the statistics while drafts are shown. */
 const FIGURES_MS = 200;
 
 export class Picture {
@@ -27,12 +28,14 @@ export class Picture {
   }
 
   /**
-   * @param {PictureMessage} message
-   * @param {ArrayBuffer} bytes A JPEG.
+   * Shows a picture.
+   *
+   * @param {PictureMessage} message The message of the picture.
+   * @param {ArrayBuffer} bytes The picture as a JPEG.
    */
   async show(message, bytes) {
     const { app } = this;
-    // A further picture for an old request may still arrive after the camera has moved.
+    // Another picture for an old request may still arrive after the camera has moved.
     const isLate = message.number !== app.requests.number;
     if (isLate && message.number === this.message?.number) return;
     const bitmap = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
@@ -53,7 +56,7 @@ export class Picture {
     app.redraw();
   }
 
-  /** Displays whether the picture is the final one of the last request. */
+  /** Shows whether the picture is the final one of the last request. */
   sayState() {
     if (!this.message) return;
     const { status, requests, look } = this.app;
@@ -69,7 +72,9 @@ export class Picture {
     else status.say("refining", `refining, ${size}`);
   }
 
-  /** Transforms the picture to where it would appear from the present camera. */
+  /**
+   * Transforms the picture to the position at which the current camera would see it.
+   */
   place() {
     if (!this.message) return;
     const { camera, look } = this.app;

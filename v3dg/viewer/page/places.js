@@ -1,5 +1,5 @@
-// Places for the camera: the whole scene, a point, an instance, a camera of the file; and the up
-// axis.
+// Places for the camera: the whole scene, a point, an instance, or a camera of the
+// file. Also the up axis.
 
 import * as M from "./math.js";
 import { AXES } from "./camera.js";
@@ -12,7 +12,7 @@ import { AXES } from "./camera.js";
 /** Directions count as equal if the cosine of the angle between them exceeds this value. */
 const SAME_DIRECTION = 0.9999;
 const HOME_FOV_Y = Math.PI / 4;
-/** Angle above the horizon for a view of the whole scene, radians. */
+/** Angle above the horizon, in radians, for a view of the whole scene. */
 const HOME_PITCH = 0.45;
 
 export class Places {
@@ -46,7 +46,7 @@ export class Places {
   }
 
   /**
-   * The first view of the scene, which shows all of an object, or a room from inside.
+   * The first view of the scene. It shows an object completely, and a room from inside.
    *
    * @returns {Pinhole}
    */
@@ -62,8 +62,8 @@ export class Places {
   }
 
   /**
-   * The first view for the widest window that is not wider than this window, or else for the
-   * narrowest.
+   * The first view for the widest window that is not wider than this window. If there
+   * is none, the view for the narrowest window.
    */
   get firstHome() {
     const { homes } = this.app.scene;
@@ -72,7 +72,8 @@ export class Places {
   }
 
   /**
-   * A view of the whole scene from slightly above, for an up axis that the user chose.
+   * A view of the whole scene from slightly above, for an up axis that the user has
+   * chosen.
    *
    * @returns {Pinhole}
    */
@@ -81,7 +82,8 @@ export class Places {
     const side = M.unit(M.cross(camera.up, M.axisAcross(camera.up)));
     const level = M.mul(side, Math.cos(HOME_PITCH));
     const forward = M.add(level, M.mul(camera.up, -Math.sin(HOME_PITCH)));
-    // In a window that is higher than wide, the horizontal field of view is the smaller one.
+    // If the window is higher than wide, the horizontal field of view is the smaller
+    // one.
     const half = Math.atan(Math.tan(HOME_FOV_Y / 2) * Math.min(1, look.aspect));
     const distance = (0.95 * scene.radius) / Math.sin(half);
     const position = M.sub(scene.center, M.mul(forward, distance));
@@ -94,8 +96,8 @@ export class Places {
   }
 
   /**
-   * Flies to a place that the user typed: x y z, # and the number of an instance, or the name of a
-   * camera.
+   * Flies to a place that the user has typed: x y z, # and the number of an instance,
+   * or the name of a camera.
    *
    * @param {string} text
    */
@@ -118,7 +120,11 @@ export class Places {
     }
   }
 
-  /** @param {number} instance */
+  /**
+   * Flies to an instance.
+   *
+   * @param {number} instance The number of the instance.
+   */
   goToInstance(instance) {
     const { app } = this;
     const last = app.scene.instances - 1;

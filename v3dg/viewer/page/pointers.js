@@ -1,5 +1,5 @@
-// Mouse and touch: drags turn the camera or move an instance, clicks pick, and the wheel changes
-// the distance.
+// Mouse and touch. A drag turns the camera or moves an instance, a click picks, and the
+// wheel changes the distance.
 
 import * as M from "./math.js";
 
@@ -7,10 +7,13 @@ import * as M from "./math.js";
 /** @typedef {import("./page.js").Place} Place */
 /** @typedef {{ x: number, y: number, time: number, hasMoved: boolean, button: number }} Press */
 
-/** A press that moves less than this and is shorter than this is a click. */
+/** A press counts as a click if it moves less and takes less time than this. */
 const CLICK_PX = 5;
 const CLICK_MS = 500;
-/** A click this close to the previous one, and within this time, is a double click. */
+/**
+ * A click counts as a double click if it is this close to the last click, in px and in
+ * time.
+ */
 const DOUBLE_CLICK_PX = 12;
 const DOUBLE_CLICK_MS = 400;
 /** Largest distance between a press and a handle, px. */
@@ -22,13 +25,14 @@ const MOST_WHEEL_PX = 300;
 
 export class Pointers {
   /**
-   * Positions of the mouse while its button is pressed, or of fingers, by the pointer's id.
+   * Positions of the mouse while a button is pressed, or of fingers, by the pointer's
+   * id.
    *
    * @type {Map<number, Place>}
    */
   places = new Map();
   /**
-   * The first press of these pointers; null before any press.
+   * The first press of the current pointers; null before any press.
    *
    * @type {Press}
    */
@@ -55,6 +59,8 @@ export class Pointers {
   }
 
   /**
+   * Returns the position of a pointer in the picture.
+   *
    * @param {PointerEvent} event
    * @returns {Place}
    */
@@ -63,7 +69,11 @@ export class Pointers {
     return [event.clientX - box.left, event.clientY - box.top];
   }
 
-  /** @param {PointerEvent} event */
+  /**
+   * Handles a button that is pressed, or a finger that touches.
+   *
+   * @param {PointerEvent} event
+   */
   press(event) {
     const { crop, instances, overlay } = this.app;
     const { button, pointerId, pointerType } = event;
@@ -74,7 +84,7 @@ export class Pointers {
     instances.grip = null;
     crop.grip = null;
     if (this.places.size > 1) {
-      this.start.hasMoved = true; // a press with two fingers is not a click
+      this.start.hasMoved = true; // a press with two fingers cannot be a click
       return;
     }
     this.start = { x, y, time: performance.now(), hasMoved: false, button };
@@ -83,7 +93,11 @@ export class Pointers {
     instances.grip = overlay.handles.gripAt(x, y, slack);
   }
 
-  /** @param {PointerEvent} event */
+  /**
+   * Handles a pointer that moves.
+   *
+   * @param {PointerEvent} event
+   */
   move(event) {
     const { app } = this;
     const [x, y] = this.placeOf(event);
@@ -97,15 +111,16 @@ export class Pointers {
     else if (app.crop.grip) app.crop.drag(x, y);
     else if (app.instances.grip) app.instances.setPose(app.overlay.handles.drag(x, y));
     else if (this.start.hasMoved) this.drag(x - before[0], y - before[1], event.shiftKey);
-    else return; // may still be a click
+    else return; // the press may still become a click
     this.places.set(event.pointerId, [x, y]);
     app.redraw();
   }
 
   /**
-   * Moving two fingers moves the camera sideways; spreading them moves it closer.
+   * Handles two fingers. Moving them moves the camera sideways, and spreading them
+   * moves it closer.
    *
-   * @param {number} pointerId Id of the finger that moves.
+   * @param {number} pointerId The id of the finger that moves.
    * @param {Place} before
    * @param {Place} now
    */
@@ -118,9 +133,11 @@ export class Pointers {
   }
 
   /**
+   * Handles a drag.
+   *
    * @param {number} dx
    * @param {number} dy
-   * @param {boolean} hasShift
+   * @param {boolean} hasShift Whether Shift is held, so that the camera moves sideways.
    */
   drag(dx, dy, hasShift) {
     const { camera } = this.app;
@@ -135,7 +152,7 @@ export class Pointers {
   }
 
   /**
-   * Moves the camera sideways, so that the focus follows the pointer.
+   * Moves the camera sideways, such that the focus follows the pointer.
    *
    * @param {number} dx
    * @param {number} dy
@@ -148,7 +165,11 @@ export class Pointers {
     camera.shift(-dx * step, -dy * step, 0);
   }
 
-  /** @param {PointerEvent} event */
+  /**
+   * Handles a button that is released, or a finger that is lifted.
+   *
+   * @param {PointerEvent} event
+   */
   release(event) {
     if (!this.places.delete(event.pointerId)) return;
     if (this.app.crop.grip) {
@@ -167,6 +188,8 @@ export class Pointers {
   }
 
   /**
+   * Handles a click at a position in the picture.
+   *
    * @param {number} x
    * @param {number} y
    */
@@ -183,7 +206,11 @@ export class Pointers {
     else app.instances.pick(x / clientWidth, y / clientHeight);
   }
 
-  /** @param {WheelEvent} event */
+  /**
+   * Handles the wheel of the mouse.
+   *
+   * @param {WheelEvent} event
+   */
   wheel(event) {
     event.preventDefault();
     const { camera } = this.app;

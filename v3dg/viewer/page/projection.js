@@ -1,4 +1,4 @@
-// Projects points of the world into the picture, and draws lines between them.
+// Projects points of the world to the picture, and draws lines between them.
 
 import * as M from "./math.js";
 
@@ -7,7 +7,10 @@ import * as M from "./math.js";
 /** @typedef {import("./page.js").Vector} Vector */
 /** @typedef {[Vector, Vector]} Line */
 
-/** Points and lines closer to the camera than this are not drawn; in radii of the scene. */
+/**
+ * Points and lines closer to the camera than this, in radii of the scene, are not
+ * drawn.
+ */
 const NEAREST_POINT = 1e-6;
 const NEAREST_OF_LINE = 1e-4;
 
@@ -31,7 +34,7 @@ export class Projection {
   }
 
   /**
-   * Returns a point in the camera's coordinates: right, down and forward.
+   * Returns a point in the camera's coordinates (right, down and forward).
    *
    * @param {Vector} point
    */
@@ -40,7 +43,9 @@ export class Projection {
   }
 
   /**
-   * @param {Vector} point A point in the camera's coordinates, in front of it.
+   * Returns the position of a point in the picture.
+   *
+   * @param {Vector} point A point in the camera's coordinates, in front of the camera.
    * @returns {Place}
    */
   project([x, y, z]) {
@@ -48,7 +53,8 @@ export class Projection {
   }
 
   /**
-   * Returns the place of a point in the picture; null if it is behind the camera.
+   * Returns the position of a point in the picture, or null if the point is behind the
+   * camera.
    *
    * @param {Vector} point
    */
@@ -59,8 +65,8 @@ export class Projection {
   }
 
   /**
-   * Returns the direction of the ray through a place in the picture, in the world; its length is
-   * arbitrary.
+   * Returns the direction of the ray through a position in the picture, in the world.
+   * It may have any length.
    *
    * @param {Place} place
    */
@@ -71,8 +77,10 @@ export class Projection {
   }
 
   /**
+   * Draws lines.
+   *
    * @param {string} color
-   * @param {number} width Px.
+   * @param {number} width The width of the lines, px.
    * @param {Line[]} lines
    */
   stroke(color, width, lines) {
@@ -84,7 +92,11 @@ export class Projection {
     context.stroke();
   }
 
-  /** @param {Line} line A line, of which only the part in front of the camera is drawn. */
+  /**
+   * Adds a line to the current path.
+   *
+   * @param {Line} line A line, which is clipped to the part in front of the camera.
+   */
   addLine([start, end]) {
     const near = NEAREST_OF_LINE * this.camera.radius;
     let p = this.inCamera(start);

@@ -14,8 +14,8 @@ export type Shows =
   | "difference";
 
 /**
- * Requests a new asset with the gaussians of a bundle whose centres are inside a
- * box, or with all others.
+ * Requests a new asset from the gaussians of a bundle whose centres are inside a
+ * box, or from all others.
  *
  * Attributes:
  *     instance: An instance of the bundle.
@@ -30,7 +30,7 @@ export interface Crop {
   name: string;
 }
 
-/** The work that the page requested has ended. */
+/** The work that the web page requested has ended. */
 export interface Done {
   type: "done";
 }
@@ -82,9 +82,9 @@ export interface FileCamera {
  * The first message of a connection.
  *
  * Attributes:
- *     version: Version of the viewer. A page of another version reloads itself.
+ *     version: Version of the viewer. A web page of another version reloads itself.
  *     up: The direction that points up in the world.
- *     asks_up: Whether `up` is only assumed; then the page asks the user.
+ *     asks_up: Whether `up` is only assumed. If so, the web page asks the user.
  *     settings: The initial settings of a tab.
  *     defaults: The default of each setting.
  */
@@ -114,8 +114,8 @@ export interface Home {
  * The limits of values that the viewer accepts.
  *
  * Attributes:
- *     picture_px: Largest length of a picture's longer side.
- *     path_seconds: Largest duration of a path.
+ *     picture_px: Maximum length of a picture's longer side.
+ *     path_seconds: Maximum duration of a path.
  */
 export interface Limits {
   tolerance: [number, number];
@@ -149,7 +149,7 @@ export interface Move {
   scale: number;
 }
 
-/** A message for the user, shown once. */
+/** A message for the user. It is shown once. */
 export interface Notice {
   type: "notice";
   text: string;
@@ -174,7 +174,7 @@ export interface Open {
  * Attributes:
  *     at: The point, as fractions of the width and the height from the upper left
  *         corner.
- *     instance: The instance to describe; then the point is ignored.
+ *     instance: The instance to describe. If it is given, the point is ignored.
  */
 export interface Pick {
   type: "pick";
@@ -184,12 +184,13 @@ export interface Pick {
 }
 
 /**
- * The answer to `Pick`: an instance. All fields are unset if there is none.
+ * The answer to `Pick`: an instance. If there is none, no field is set.
  *
  * Attributes:
  *     box: Minimum and maximum corner of the instance's bundle, in the coordinates of
  *         the bundle.
- *     bundle: Name of the bundle's file; empty if the bundle is not in a file.
+ *     bundle: Name of the bundle's file, or an empty text if the bundle is not in a
+ *         file.
  *     point: The picked point in the world.
  */
 export interface Picked {
@@ -209,10 +210,10 @@ export interface Picked {
  *     number: Number of the request.
  *     size: Width and height, px.
  *     view: The viewpoint of the picture.
- *     range: The values of the darkest and the brightest colour, if colours represent
+ *     range: The values of the darkest and the brightest colour if colours represent
  *         values.
- *     distance: Median depth around the middle, in world units; null if nothing is
- *         there, or if it is unknown.
+ *     distance: Median depth around the middle, in world units. It is null if nothing
+ *         is there, or if it is unknown.
  */
 export interface Picture {
   type: "picture";
@@ -252,7 +253,7 @@ export interface Progress {
  * Attributes:
  *     what: The file: a picture, a film of the path, its cameras, or the scene.
  *     look: The content and the size of pictures.
- *     up: The axis that points up, for the file of a scene; null for other directions.
+ *     up: The axis that points up, for a scene file. It is null for other directions.
  *     path: The views of the path, each with the seconds since the previous view.
  */
 export interface Save {
@@ -272,16 +273,16 @@ export interface Save {
  *     homes: First views for windows from narrow to wide.
  *     instances: Number of instances.
  *     has_files: Whether all bundles are in files, so that the scene can be saved.
- *     writes_files: Whether the server writes new assets beside the file of the
- *         subject; otherwise the browser saves them.
+ *     writes_files: Whether the server writes new assets next to the file of the
+ *         subject. If not, the browser saves them.
  *     level_colors: Colour of each level.
  *     ramp: Colours for values from the smallest to the largest.
- *     most_counted: Number of gaussians in a pixel at which the last colour of the
- *         ramp is reached.
+ *     most_counted: Number of gaussians in a pixel that is shown in the last colour of
+ *         the ramp.
  *     modes: The available display modes.
  *     shows_cuts: Whether freezing, splitting and picking are available.
- *     missing_colors: Colours of gaussians that are drawn in place of no, one, two and
- *         three missing finer levels.
+ *     missing_colors: Colours of gaussians that are drawn because zero, one, two or
+ *         three finer levels are missing.
  */
 export interface Scene {
   type: "scene";
@@ -305,15 +306,16 @@ export interface Scene {
  * The content and quality of a picture.
  *
  * Attributes:
- *     shows: The display mode: the gaussians' own colours; the colours of levels,
- *         clusters or missing pages; the error, which is the screen area per gaussian
- *         of a coarser cluster; expected depth; alpha; the number of gaussians that a
- *         pixel blends; or the difference from the picture of all gaussians.
+ *     shows: The display mode. It is one of the gaussians' own colours; the colours of
+ *         levels, clusters or missing pages; the error, which is the screen area per
+ *         gaussian of a coarser cluster; expected depth; alpha; the number of
+ *         gaussians that a pixel blends; and the difference from the picture of all
+ *         gaussians.
  *     tolerance, budget, min_level, fade: As in `v3dg.render`, but the tolerance is
  *         never None.
  *     gain: Factor by which differences are multiplied.
- *     split: Left part of the picture, as a fraction of its width, that shows all
- *         gaussians; 0 for no split.
+ *     split: The left part of the picture that shows all gaussians, as a fraction of
+ *         its width. 0 means no split.
  *     frozen: The view for which the cut is selected; None for the view of the
  *         picture.
  *     background: Red, green and blue, 0 to 1, behind the gaussians. Modes whose
@@ -340,8 +342,8 @@ export interface Stop {
  * A viewpoint: a camera without a size in pixels.
  *
  * Attributes:
- *     wxyz: Rotation from camera (x right, y down, z forward) to world as a
- *         quaternion, which need not be normalised.
+ *     wxyz: Rotation from the camera's axes (x right, y down, z forward) to the world,
+ *         as a quaternion, which need not be normalised.
  *     position: Position of the camera in world units.
  *     fov_y: Vertical field of view in radians.
  *     aspect: Width divided by height.

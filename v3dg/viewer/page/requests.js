@@ -6,17 +6,17 @@
 const REST_MS = 250;
 
 export class Requests {
-  /** Number of the last request, which its pictures repeat. */
+  /** Number of the last request. The server repeats it with each picture. */
   number = 0;
   /**
-   * The last request as JSON, with which the next one is compared; null to request again.
+   * The last request as JSON, for comparison with the next one; null to request again.
    *
    * @type {string}
    */
   asked = null;
-  /** Whether anything has changed in the last `REST_MS`. */
+  /** Whether anything has changed during the last `REST_MS`. */
   isMoving = false;
-  /** Time at which the present movement began, ms. */
+  /** Time at which the current movement began, ms. */
   movedAt = 0;
   /** The timer that ends a movement. */
   restTimer = 0;
@@ -26,12 +26,15 @@ export class Requests {
     this.app = app;
   }
 
-  /** Forgets the last request, because the server may not know it or may have changed the scene. */
+  /**
+   * Clears the last request, because the server may not have received it or may have
+   * changed the scene.
+   */
   reset() {
     this.asked = null;
   }
 
-  /** Marks the picture that is shown as outdated, because the scene has changed. */
+  /** Marks the current picture as outdated, because the scene has changed. */
   expire() {
     this.reset();
     this.number += 1;
@@ -41,14 +44,14 @@ export class Requests {
   /**
    * Requests a picture if the view or the settings differ from the last request.
    *
-   * @param {number} now
+   * @param {number} now Time of the frame, ms.
    */
   update(now) {
     const { app } = this;
     const { message } = app.look;
     const text = JSON.stringify(message);
     if (text !== this.asked) {
-      app.redraw(); // tries again until the request is sent
+      app.redraw(); // try again until the request is sent
       if (!app.connection.isFree) return;
       this.number += 1;
       app.connection.send({ ...message, number: this.number });
@@ -58,7 +61,11 @@ export class Requests {
     app.picture.sayState();
   }
 
-  /** @param {number} now */
+  /**
+   * Starts or continues a movement.
+   *
+   * @param {number} now Time of the frame, ms.
+   */
   move(now) {
     if (!this.isMoving) this.movedAt = now;
     this.isMoving = true;

@@ -1,4 +1,4 @@
-// Messages of the page: the line below the picture, and notices above it.
+// Messages of the web page: the line below the picture, and notices above it.
 
 import { element, make } from "./elements.js";
 
@@ -11,6 +11,8 @@ export class Status {
   refinedBar = element("refined").querySelector("div");
 
   /**
+   * Shows the state of the connection or of the picture.
+   *
    * @param {State} state
    * @param {string} text
    */
@@ -19,22 +21,36 @@ export class Status {
     element("status").textContent = text;
   }
 
-  /** @param {number} share Width of the picture as a fraction of the full width. */
+  /**
+   * Shows how far the picture is refined.
+   *
+   * @param {number} share The width of the picture as a fraction of the full width.
+   */
   showRefined(share) {
     this.refinedBar.style.width = `${100 * share}%`;
   }
 
-  /** @param {string} text A description of the problem. */
+  /**
+   * Shows a warning.
+   *
+   * @param {string} text A description of the problem.
+   */
   warn(text) {
     this.addNotice(text, "");
   }
 
-  /** @param {string} text A description of the action. */
+  /**
+   * Confirms an action.
+   *
+   * @param {string} text A description of the action.
+   */
   confirm(text) {
     this.addNotice(text, "good");
   }
 
   /**
+   * Shows a notice for some time.
+   *
    * @param {string} text
    * @param {string} className
    */

@@ -7,7 +7,10 @@ import { element, make } from "./elements.js";
 /** @typedef {import("./page.js").Axis} Axis */
 /** @typedef {import("./page.js").Tool} Tool */
 
-/** Media query for windows in which the panel covers the picture; the same as in style.css. */
+/**
+ * Media query for windows in which the panel covers the picture. It is the same as in
+ * style.css.
+ */
 const SMALL_WINDOW = "(max-width: 700px), (max-height: 480px)";
 
 export class Toolbar {
@@ -27,7 +30,7 @@ export class Toolbar {
     if (matchMedia(SMALL_WINDOW).matches) this.foldPanel();
   }
 
-  /** Adds a button for each axis to the question which way is up. */
+  /** Adds a button for each axis to the question about the up direction. */
   addAxes() {
     for (const axis of Object.keys(AXES)) {
       const attributes = { role: "radio", "data-up": axis, title: `${axis} is up` };
@@ -35,7 +38,11 @@ export class Toolbar {
     }
   }
 
-  /** @param {DOMStringMap} data The data attributes of the button. */
+  /**
+   * Executes the action of a button.
+   *
+   * @param {DOMStringMap} data The data attributes of the button.
+   */
   press({ mode, tool, up, act }) {
     const { app } = this;
     if (isMode(mode)) app.setMode(mode);
@@ -58,7 +65,7 @@ export class Toolbar {
     app.sync();
   }
 
-  /** Updates which mode, tool and axis are marked as chosen. */
+  /** Marks the mode, the tool and the axis that are chosen. */
   sync() {
     const { camera, instances, places } = this.app;
     check("mode", camera.mode);
@@ -67,7 +74,11 @@ export class Toolbar {
     this.tools.hidden = !instances.selected;
   }
 
-  /** @param {boolean} isShown */
+  /**
+   * Shows or hides the question about the up direction.
+   *
+   * @param {boolean} isShown
+   */
   showQuestion(isShown) {
     this.question.hidden = !isShown;
   }
@@ -84,7 +95,7 @@ export class Toolbar {
 }
 
 /**
- * Marks the button whose attribute `data-…` has a value as chosen, and no other button.
+ * Marks the one button whose attribute `data-…` has this value as chosen.
  *
  * @param {"mode" | "tool" | "up"} name
  * @param {string | null} value
@@ -95,7 +106,11 @@ function check(name, value) {
   }
 }
 
-/** @param {string} selector */
+/**
+ * Returns the buttons that match a selector.
+ *
+ * @param {string} selector
+ */
 function buttons(selector) {
   return /** @type {NodeListOf<HTMLButtonElement>} */ (document.querySelectorAll(selector));
 }
