@@ -71,8 +71,8 @@ struct BoundLook {
 void check_clipped(const SensorRequest& request, const Camera& camera) {
     if (request.channels.clipped && !camera.is_pinhole())
         throw py::value_error(
-            "channels: 'clipped' is defined for pinholes, got a camera with another lens; leave "
-            "it out");
+            "channels: 'clipped' needs a pinhole camera, got a camera with another lens; leave "
+            "'clipped' out");
 }
 
 // Returns the request for channels and meshes in pictures of these eyes. `sensor` is a

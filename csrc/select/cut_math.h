@@ -116,8 +116,8 @@ struct InstanceCut {
     }
 };
 
-// Returns the decisions of an instance. The states of groups are computed anew at each
-// call.
+// Returns an InstanceCut that decides about the clusters of one instance. It stores
+// nothing: each time a cluster asks for the state of a group, the state is computed.
 V3DG_HD inline InstanceCut<AskedGroups> cut_by_asking(const ClusterTable& table,
                                                       const InstanceView& view,
                                                       const SelectRule& rule) {

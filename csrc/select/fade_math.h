@@ -1,6 +1,7 @@
 #pragma once
 
-// Compares a metric with the tolerance, and computes how far a group is refined.
+// Compares a metric with the tolerance, and computes how far a group is refined. The
+// weight of a cluster is the difference of two such values (cut_math.h).
 
 #include <cstdint>
 

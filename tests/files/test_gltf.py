@@ -463,8 +463,7 @@ def test_nothing_outside_of_the_folder_is_read(tmp_path, uri):
     (folder / "parts").mkdir(parents=True)
     (tmp_path / "a.bin").write_bytes(file.blob)
     path = file.write(folder / "a.gltf", uri)
-    expected = "buffers.0..uri: expected a path inside the folder of the document, or a data: URI"
-    with pytest.raises(ValueError, match=expected):
+    with pytest.raises(ValueError, match=r"buffers.0..uri: expected a (relative )?path .*, got"):
         v3dg.read_asset(path)
 
 

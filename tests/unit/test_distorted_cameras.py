@@ -318,7 +318,7 @@ def test_a_batch_of_lenses_is_drawn_as_its_cameras_alone(lens):
         distance = batch.distance[number]
         np.testing.assert_allclose(distance, alone.depth * lengths, rtol=1e-5)
         assert (distance > 0).any()
-    with pytest.raises(ValueError, match=r"^channels: 'clipped' is defined for pinholes"):
+    with pytest.raises(ValueError, match=r"^channels: 'clipped' needs a pinhole camera"):
         renderer.render_batch(v3dg.CameraBatch.of(cameras), channels=["clipped"])
 
 

@@ -206,15 +206,18 @@ class Document:
         """Return the file at a relative URI. URIs that lead out of the document's
         folder are rejected."""
         text = uri.text()
-        expected = "a path inside the folder of the document, or a data: URI"
         if _SCHEME.match(text) or "?" in text or "#" in text:
-            raise uri.error(expected)
+            raise uri.error("a relative path without '?' and '#', or a data: URI")
         name = unquote(text)
         parts = name.split("/")
         is_below = not {"", ".."} & set(parts) and "\\" not in name
         is_short = all(len(os.fsencode(part)) <= _MOST_NAME for part in parts)
         if not is_below or not is_one_line(name) or not is_short:
-            raise uri.error(expected)
+            raise uri.error(
+                "a path inside the folder of the document, with single '/' between names "
+                f"of at most {_MOST_NAME} bytes, without '..', '\\' and line breaks, "
+                "or a data: URI"
+            )
         return self.path.parent / name
 
 

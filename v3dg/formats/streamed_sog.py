@@ -147,8 +147,9 @@ def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[
     """Return, for each file, the rows of gaussians that are the finest level of a
     leaf."""
     runs: dict[PurePosixPath, list[range]] = {}
-    # A list of a million empty nodes would need as much memory as a scene, so a stack
-    # of iterators is used.
+    # With a stack of iterators, each child becomes a Node only when its turn comes. A
+    # list of all children would let a small file with a million empty children need as
+    # much memory as a scene.
     todo = [iter([tree])]
     while todo:
         node = next(todo[-1], None)

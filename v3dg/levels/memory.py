@@ -63,7 +63,11 @@ def most_units(memory: int, leaves: Leaves) -> int:
 
 
 def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Return the memory that a unit of an asset needs, in bytes."""
+    """Return the host memory in bytes that a unit needs while it is built.
+
+    A unit is a part of the tree with about `UNIT_LEAVES` leaves, which is built
+    independently of the others. A smaller asset is one unit.
+    """
     return int(
         min(num_gaussians, UNIT_LEAVES) * (_LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree))
     )

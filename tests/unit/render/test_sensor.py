@@ -379,7 +379,7 @@ def test_wrong_meshes_and_channels_are_refused(scene):
             v3dg.render(scene, camera, device="cpu", **options)
     lens = dataclasses.replace(camera, distortion=(0.1, 0.01, 0.0, 0.0), model="OPENCV")
     assert v3dg.render(scene, lens, channels=("normal",), device="cpu").normal.any()
-    with pytest.raises(ValueError, match="'clipped' is defined for pinholes"):
+    with pytest.raises(ValueError, match="'clipped' needs a pinhole camera"):
         v3dg.render(scene, lens, channels=("clipped",), device="cpu")
 
 
