@@ -6,6 +6,7 @@
 
 #include "math/instance_factors.h"
 #include "project/host_sources.h"
+#include "project/store_records.h"
 
 namespace v3dg {
 namespace V3DG_ISA {
@@ -33,23 +34,16 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
         from.color_of(at, count, direction, color);
         if (draw.color_factors != nullptr) tint(draw.color_factors, color);
     }
-    for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
-        const int i = __builtin_ctz(lanes);
-        const Ellipse<T> mine{e.u[i],    e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i],
-                              e.depth[i]};
-        set_ellipse(mine,
-                    PixelBox<int>{static_cast<int>(box.x0[i]), static_cast<int>(box.x1[i]),
-                                  static_cast<int>(box.y0[i]), static_cast<int>(box.y1[i])},
-                    *r);
-        for (int c = 0; c < 3; ++c) r->color[c] = color[c][i];
-    }
+    store_records(lanes, count, e, color, box, records);
 }
 
 // Implements project() for one source. `first` is the row of the first gaussian.
 template <class Source, class T, ProjectingModel C>
 static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t first, uint64_t count,
-                           const C& camera, const Window& window, Record<T>* records,
+                           const C& model, const Window& window, Record<T>* records,
                            uint32_t* source, uint32_t source_base, Reach& reach) {
+    // Of a copy, the compiler knows that writing records does not change it.
+    const C camera = model;
     using V = Vec<T>;
     using I = decltype(V{} < V{});
     constexpr int kWidth = kLanes<T>;

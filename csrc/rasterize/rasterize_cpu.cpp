@@ -12,9 +12,8 @@ template <class T, Extra kExtra, class Stop>
 static void blend_entries(const Record<T>* records, EntryFormat format, const uint64_t* entry,
                           size_t count, int left, int top, const Window& window, Stop stop,
                           TilePlanes<T>& tile) {
-    blend_tile<T, kExtra>(count, left, top, window, stop, tile, [&](size_t i) {
-        return Listed<T>{records + format.record_of(entry[i]), EntryFormat::blocks_of(entry[i])};
-    });
+    blend_tile<T, kExtra>(count, left, top, window, stop, tile,
+                          ListedEntries<T>{records, format, entry});
 }
 
 template <class T>

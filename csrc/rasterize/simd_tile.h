@@ -56,36 +56,90 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
-// From this number of touched blocks on, the exact test of the ellipse saves time.
-// Blocks are cheapest to draw if one vector covers a whole block.
+// A block consists of strips: as many rows as one vector covers, if that is half of the
+// block or all of it, and otherwise half of it.
+constexpr int kStrips = kLanes<float> == kBlockPixels ? 1 : 2;
+constexpr int kStripRows = kBlockSize / kStrips;
+constexpr int kStripPixels = kStripRows * kBlockSize;
+
+// Strips of a tile. strip[s] has the bits of the blocks whose strip s is meant.
+struct StripMask {
+    uint64_t strip[kStrips];
+
+    V3DG_INLINE uint64_t blocks() const {
+        uint64_t blocks = 0;
+        for (const uint64_t mask : strip) blocks |= mask;
+        return blocks;
+    }
+    V3DG_INLINE int size() const {
+        int size = 0;
+        for (const uint64_t mask : strip) size += __builtin_popcountll(mask);
+        return size;
+    }
+};
+
+// Returns the strips of these blocks that the record's box touches. Precondition: the
+// box touches the tile.
+template <class T>
+V3DG_INLINE StripMask strips_of_box(const Record<T>& g, int top, uint64_t blocks) {
+    StripMask strips;
+    strips.strip[0] = blocks;
+    if constexpr (kStrips == 2) {
+        // There is no branch, because none could be predicted. The signs are masks.
+        const int above = g.y0 - top, below = g.y1 - top - (kTileSize - 1);
+        const unsigned first = static_cast<unsigned>(above & ~(above >> 31)),
+                       last = static_cast<unsigned>(kTileSize - 1 + (below & (below >> 31)));
+        constexpr uint64_t kRow = (uint64_t(1) << kTileBlocks) - 1;
+        const uint64_t first_row = kRow << (first / kBlockSize * kTileBlocks),
+                       last_row = kRow << (last / kBlockSize * kTileBlocks);
+        const uint64_t starts_low = first / kStripRows % 2, ends_low = last / kStripRows % 2;
+        strips.strip[0] = blocks & ~(first_row * starts_low);
+        strips.strip[kStrips - 1] = blocks & ~(last_row * (1 - ends_low));
+    }
+    return strips;
+}
+
+// Returns the strips that the ellipse reaches. For each row of strips, it computes the
+// extent of the ellipse in x over the rows of pixel centres, with the margin of
+// row_extent(). Values are rounded by truncation, because every instruction set has a
+// single instruction for it.
+template <class T>
+V3DG_INLINE StripMask strips_of_ellipse(const Record<T>& g, int left, int top) {
+    const EllipseRows<T> ellipse = ellipse_rows(g.l11, g.l12, g.l22, g.log2_opacity);
+    const T u = g.u - T(left) - T(0.5), v = g.v - T(top) - T(0.5);
+    StripMask strips;
+    for (int s = 0; s < kStrips; ++s) {
+        int first[kTileBlocks], last[kTileBlocks];
+        for (int row = 0; row < kTileBlocks; ++row) {
+            const T low = T(kBlockSize * row + kStripRows * s) - v;
+            T x0, x1;
+            row_extent(ellipse, low, low + T(kStripRows - 1), x0, x1);
+            x0 = min_of(max_of(u + x0, T(-1)), T(kTileSize));
+            x1 = min_of(max_of(u + x1, T(-1)), T(kTileSize));
+            first[row] = static_cast<int>(max_of(x0, T(0))) >> 2;
+            last[row] = x1 < 0 ? -1 : static_cast<int>(x1) >> 2;
+        }
+        // The blocks from the first on, without those behind the last.
+        uint8_t columns[kTileBlocks];
+        for (int row = 0; row < kTileBlocks; ++row)
+            columns[row] =
+                static_cast<uint8_t>((0xffu << first[row]) & ~(0xffu << (last[row] + 1)));
+        uint64_t mask = 0;
+        for (int row = 0; row < kTileBlocks; ++row)
+            mask |= uint64_t(columns[row]) << (kTileBlocks * row);
+        strips.strip[s] = mask;
+    }
+    return strips;
+}
+
+// The number of touched blocks from which on the exact test pays off for whole blocks.
 constexpr int kFewBlocks = kLanes<float> == kBlockPixels ? 9 : 5;
 
-// Returns the subset of `blocks` that the ellipse reaches. For each row of blocks, it
-// computes the extent of the ellipse in x over the rows of pixel centres, with the
-// margin of row_extent(). Values are truncated, because every instruction set can do
-// this in one instruction.
+// Returns the subset of `blocks` that the ellipse reaches, or a set between the two.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
-    const EllipseRows<T> ellipse = ellipse_rows(g.l11, g.l12, g.l22, g.log2_opacity);
-    const T u = g.u - T(left) - T(0.5), v = g.v - T(top) - T(0.5);
-    int first[kTileBlocks], last[kTileBlocks];
-    for (int row = 0; row < kTileBlocks; ++row) {
-        const T low = T(kBlockSize * row) - v;
-        T x0, x1;
-        row_extent(ellipse, low, low + T(kBlockSize - 1), x0, x1);
-        x0 = min_of(max_of(u + x0, T(-1)), T(kTileSize));
-        x1 = min_of(max_of(u + x1, T(-1)), T(kTileSize));
-        first[row] = static_cast<int>(max_of(x0, T(0))) >> 2;
-        last[row] = x1 < 0 ? -1 : static_cast<int>(x1) >> 2;
-    }
-    uint64_t mask = 0;
-    for (int row = 0; row < kTileBlocks; ++row) {
-        const int c0 = first[row], c1 = last[row] < kTileBlocks ? last[row] : kTileBlocks - 1;
-        if (c0 > c1) continue;
-        mask |= uint64_t((0xffu >> (kTileBlocks - 1 - c1)) & (0xffu << c0)) << (8 * row);
-    }
-    return blocks & mask;
+    return blocks & strips_of_ellipse(g, left, top).blocks();
 }
 
 // Returns the live blocks of the tile that the record may change. Precondition: the

@@ -215,9 +215,7 @@ class SplatCamera:
             shape_index_image: (V, H, W) uint32: the shape with the largest weight. It
                 is `NO_SHAPE` for instances that belong to no shape, and for meshes.
             normal_image: (V, H, W) vec3f in the world.
-            mesh: Meshes among the gaussians; on CUDA devices, meshes and the channels
-                other than depth are drawn as far as `Renderer.render_batch` supports
-                them.
+            mesh: Meshes among the gaussians.
 
         Returns:
             The pictures, as NumPy arrays or as torch tensors on the model's device.

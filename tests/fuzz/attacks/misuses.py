@@ -278,6 +278,9 @@ def _calls(shared, work):
         channels = ("depth", "normal", "label", "weight")
         mesh = v3dg.MeshLayer(**values)
         v3dg.render(scene, camera, mesh=mesh, channels=channels, device="cpu")
+        v3dg.render(scene, [camera, camera], mesh=[mesh, mesh], device="cpu")
+        stereo = v3dg.StereoCamera.of(camera, 0.1)
+        v3dg.render(scene, stereo, mesh=[mesh, mesh], device="cpu")
 
     def drawn_into(**values):
         planes = v3dg.BatchPlanes(**values)

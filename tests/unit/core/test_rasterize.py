@@ -165,6 +165,17 @@ def test_every_count_of_gaussians(device, num):
     assert_pictures_agree(draw(device, gaussians, camera, filter_px2=0.1), picture, PICTURE_FLOAT)
 
 
+@pytest.mark.parametrize("num", [63, 64, 65, 511, 512, 513, 1100])
+def test_every_count_of_gaussians_in_one_tile(device, num):
+    # Faint gaussians, so that the last ones show, of which some reach all of the tile.
+    camera = scenes.camera(30, 30, fx=40.0, cx=15.0, cy=15.0)
+    faint = scenes.random_gaussians(
+        num, camera, num, size_px=(0.5, 9), opacity=(0.01, 0.03), margin=0
+    )
+    picture = reference.rasterize(faint, camera, filter_px2=0.1)
+    assert_pictures_agree(draw(device, faint, camera, filter_px2=0.1), picture, PICTURE_FLOAT)
+
+
 @pytest.mark.parametrize(
     "size", [(1, 1), (1, 40), (40, 1), (31, 33), (32, 32), (33, 31), (64, 65), (129, 3)]
 )
