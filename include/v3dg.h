@@ -6,7 +6,8 @@
  *
  * Errors: a function that can fail returns a v3dg_status. After a failure,
  * v3dg_last_error() returns a sentence about it, and nothing was written to the results.
- * No C++ exception leaves the library. Files may be hostile: wrong ones are errors.
+ * No C++ exception leaves the library. Invalid files, including malicious ones, are
+ * errors.
  *
  * Threads: several threads may call functions that take a const v3dg_scene with the same
  * scene at the same time. A function that takes a v3dg_scene without const needs exclusive
@@ -120,17 +121,17 @@ typedef struct v3dg_camera {
 
 #define V3DG_NO_BUDGET UINT64_MAX
 
-/* How a cut is chosen. V3DG_DEFAULT_RULE is the rule that NULL stands for. */
+/* The rule by which a cut is chosen. NULL means V3DG_DEFAULT_RULE. */
 typedef struct v3dg_rule {
-    /* Largest screen area, px² a gaussian, at which a coarser cluster replaces finer ones:
-     * at least 0. */
+    /* Largest screen area, in px² per gaussian, at which a coarser cluster replaces finer
+     * ones. At least 0. */
     double tolerance_px2;
     /* Clusters within this factor of the tolerance are drawn on two or more levels, whose
-     * weights add up to 1, so that nothing pops while the camera moves: 1 (off) to 1000;
-     * 1.02 for sequences of pictures. */
+     * weights add up to 1, so that nothing pops while the camera moves. 1 (no fade) to 1000;
+     * 1.02 suits sequences of pictures. */
     double fade;
     /* Largest number of gaussians, or V3DG_NO_BUDGET. The tolerance is raised until the cut
-     * has no more; it begins at tolerance_px2, which usually is 0 with a budget. */
+     * has no more. It begins at tolerance_px2, which is usually 0 with a budget. */
     uint64_t budget;
     int32_t min_level; /* finer levels are not chosen */
     int32_t culls;     /* 1: leave out clusters outside of the picture */
@@ -161,7 +162,7 @@ typedef struct v3dg_cut {
     const v3dg_pair* pairs; /* ordered by instance, then by cluster */
     uint64_t num_pairs;
     uint64_t num_gaussians; /* of all pairs together */
-    /* Most urgent first, and each page after the pages above it. */
+    /* The most urgent pages come first, and each page comes after the pages above it. */
     const v3dg_missing_page* missing;
     uint64_t num_missing;
     uint64_t revision;   /* of the scene's instances when the cut was selected */
@@ -178,7 +179,7 @@ typedef struct v3dg_gaussians {
      * The colour of degree 0 is 0.28209479 times the first coefficient plus 0.5. */
     float* sh;
     uint64_t capacity; /* number of gaussians that each array has room for */
-    /* 0 to 3: higher coefficients are left out, absent ones are 0. */
+    /* 0 to 3. Coefficients of higher degrees are left out, and absent ones are 0. */
     int32_t sh_degree;
 } v3dg_gaussians;
 

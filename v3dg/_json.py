@@ -107,7 +107,7 @@ class Node:
         self.file = file
         self.path = path
 
-    def problem(self, text: str) -> ValueError:
+    def located_error(self, text: str) -> ValueError:
         """Return an error whose message begins with the location."""
         return ValueError(f"{self.file}: {self.path or 'top level'}: {text}")
 
@@ -115,7 +115,7 @@ class Node:
         text = f"expected {expected}, got {json_text(self.value)}"
         if advice:
             text = f"{text}; {advice}"
-        return self.problem(text)
+        return self.located_error(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
         """Return the result of ``make``. A ValueError of ``make`` begins with the name
@@ -133,7 +133,7 @@ class Node:
         if not isinstance(self.value, dict):
             raise self.error("an object")
         if key not in self.value:
-            raise self.problem(f"expected the field {key}, got an object without it")
+            raise self.located_error(f"expected the field {key}, got an object without it")
         path = key
         if not is_one_line(key) or len(key) > 60:
             path = json_text(key)
@@ -169,7 +169,7 @@ class Node:
         for key, node in fields.items():
             if key not in required and key not in optional:
                 allowed = ", ".join((*required, *optional))
-                raise node.problem(f"expected one of {allowed}, got an unknown field")
+                raise node.located_error(f"expected one of {allowed}, got an unknown field")
         return fields
 
     def text(self) -> str:

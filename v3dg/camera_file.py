@@ -183,10 +183,12 @@ def _frames_at_top(document: Node) -> dict[str, Node]:
     other file."""
     if document.has("keyframes") or document.has("camera_path"):
         advice = "save the path in nerfstudio's viewer, which then writes its frames, too"
-        raise document.problem(f"expected frames in camera_path, got none; {advice}")
+        raise document.located_error(f"expected frames in camera_path, got none; {advice}")
     if document.has("transform") and document.has("scale"):
         advice = "give the folder of the run, or put this file beside transforms.json"
-        raise document.problem(f"expected cameras, got the transform of a run's training; {advice}")
+        raise document.located_error(
+            f"expected cameras, got the transform of a run's training; {advice}"
+        )
     return document.some_fields(("frames",))
 
 
@@ -194,7 +196,7 @@ def _read_3dgs(node: Node) -> tuple[str, Camera]:
     """Return a camera of the `cameras.json` that the code of the 3DGS paper writes.
     Rotation and position are from camera to world; x is right, y down, z forward."""
     if node.has("transform"):
-        raise node.problem(
+        raise node.located_error(
             "expected position, rotation, fx and fy, got only a pose, as written by ns-export "
             "cameras; give the folder of the run"
         )
@@ -224,7 +226,7 @@ def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[s
         width = document.field("render_width").size()
         height = document.field("render_height").size()
     elif size is None:
-        raise document.problem(
+        raise document.located_error(
             "expected render_width and render_height, got neither; pass the size of the pictures"
         )
     else:
@@ -472,11 +474,11 @@ def _intrinsics(
         width = fields["w"].size()
         height = fields["h"].size()
     elif "fl_x" in focal:
-        raise frame.problem(
+        raise frame.located_error(
             "expected w and h, in the frame or at the top, got focal lengths in px without a size"
         )
     elif size is None:
-        raise frame.problem(
+        raise frame.located_error(
             "expected w and h, in the frame or at the top, got neither; pass the size of the "
             "pictures"
         )
@@ -495,7 +497,7 @@ def _intrinsics(
             fov_y = focal["camera_angle_y"].field_of_view()
         K = frame.attempt(partial(intrinsics, fov_x, fov_y, width, height))
     else:
-        raise frame.problem(
+        raise frame.located_error(
             "expected fl_x or camera_angle_x, in the frame or at the top, got neither"
         )
     for axis, name in enumerate(("cx", "cy")):

@@ -25,9 +25,9 @@ constexpr int kAtOnce = 4;  // gaussians that a half-warp blends together
 constexpr int kSums = 9;    // values per slot: FalloffSums and colour
 constexpr int kSumStride = 12;
 
-// The shape of a kernel, fixed at compile time. It consists of the number of threads,
-// whether groups are small (frequently read arrays are then in shared memory), and the
-// chunk: the number of gaussians that a warp processes between two sums over pixels.
+// The properties of a kernel that are fixed at compile time. If groups are small,
+// frequently read arrays are in shared memory. `kChunkSize` is the number of gaussians
+// that a warp processes between two sums over pixels.
 template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
 struct FitShape {
     static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;

@@ -211,7 +211,8 @@ struct Places {
     // Number of free entries in the tile's list before this warp adds its entries.
     uint32_t left;
 
-    // All lanes of the warp must call it. A lane with kNoTile gets no position.
+    // All lanes of the warp must call the constructor. A lane with kNoTile gets no
+    // position.
     __device__ Places(const Scatter& to, uint32_t tile)
         : peers(__match_any_sync(kAllLanes, tile)), left(0) {
         if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# As a fraction of half the field of view. Beyond this margin, the Jacobian is clamped.
+# Beyond this margin around the image, the Jacobian is clamped. The margin is a fraction
+# of half the field of view.
 FIELD_OF_VIEW_MARGIN = 0.3
 
 

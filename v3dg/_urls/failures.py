@@ -65,14 +65,14 @@ def naming_errors(url: str) -> Iterator[None]:
 
 
 def _failure_of(url: str, error: Exception) -> Exception:
-    problem = error
-    if not isinstance(problem, DownloadError):
-        problem = _problem_of(url, error)
+    failure = error
+    if not isinstance(failure, DownloadError):
+        failure = _error_of(url, error)
     name = f"{shown(url)}: "
-    return problem.kind(name + str(problem).removeprefix(name))
+    return failure.kind(name + str(failure).removeprefix(name))
 
 
-def _problem_of(url: str, error: Exception) -> DownloadError:
+def _error_of(url: str, error: Exception) -> DownloadError:
     """Return the DownloadError for an error of the system, of fsspec or of aiohttp. The
     types of aiohttp are recognised by their names, because aiohttp may not be
     installed."""
@@ -102,15 +102,15 @@ def _problem_of(url: str, error: Exception) -> DownloadError:
     # Before Python 3.11, asyncio's TimeoutError is not the built-in one.
     if isinstance(cause, TimeoutError) or "TimeoutError" in names:
         return DownloadError(TimeoutError, f"the server did not answer in time; {_AGAIN}")
-    answer = _problem_of_answer(names)
+    answer = _error_of_answer(names)
     if answer is not None:
         return answer
     if isinstance(cause, ConnectionError) or "ClientError" in names:
-        return _problem_of_connection(cause, text)
-    return _problem_elsewhere(cause, text)
+        return _error_of_connection(cause, text)
+    return _error_of_file(cause, text)
 
 
-def _problem_of_connection(error: Exception, text: str) -> DownloadError:
+def _error_of_connection(error: Exception, text: str) -> DownloadError:
     if isinstance(error, ConnectionRefusedError):
         return DownloadError(
             ConnectionRefusedError, "the connection was refused; check the host and the port"
@@ -120,7 +120,7 @@ def _problem_of_connection(error: Exception, text: str) -> DownloadError:
     )
 
 
-def _problem_of_answer(names: set[str]) -> DownloadError | None:
+def _error_of_answer(names: set[str]) -> DownloadError | None:
     """Return the DownloadError for an incomplete or invalid answer, given the type
     names of an error. Return None for other errors."""
     if "ClientPayloadError" in names:
@@ -132,7 +132,7 @@ def _problem_of_answer(names: set[str]) -> DownloadError | None:
     return None
 
 
-def _problem_elsewhere(error: Exception, text: str) -> DownloadError:
+def _error_of_file(error: Exception, text: str) -> DownloadError:
     if isinstance(error, FileNotFoundError):
         return DownloadError(FileNotFoundError, "there is no such file; check the address")
     if isinstance(error, PermissionError):

@@ -123,7 +123,7 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
         ) from None
     fields = document.fields(("format", "version", "folders", "files"))
     if fields["format"].value != _FORMAT or fields["version"].value != _VERSION:
-        raise document.problem(
+        raise document.located_error(
             f"expected {_FORMAT} version {_VERSION}, got another format or version; remove the file"
         )
     folders = [_checked_name(node, _FOLDER_NAME) for node in fields["folders"].items()]

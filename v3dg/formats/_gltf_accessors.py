@@ -69,13 +69,13 @@ def indices(document: Document, accessor: Node, limit: int) -> NDArray[np.int64]
         raise accessor.field("type").error("SCALAR")
     shape = (count_of(accessor), 1)
     if accessor.has("sparse") or not accessor.has("bufferView"):
-        raise accessor.problem(
+        raise accessor.located_error(
             "expected indices in a buffer view, got sparse ones or none, which this reader does "
             "not support"
         )
     values = _rows(document, accessor, dtype, shape, is_strided=True)[:, 0].astype(np.int64)
     if len(values) and values.max() >= limit:
-        raise accessor.problem(f"expected indices below {limit}, got {values.max()}")
+        raise accessor.located_error(f"expected indices below {limit}, got {values.max()}")
     return values
 
 
@@ -92,7 +92,7 @@ def _with_sparse(
     is_ascending = bool((np.diff(numbers) > 0).all()) and numbers[-1] < num_rows
     if not is_ascending:
         problem = f"expected ascending indices below {num_rows}, got others; correct the file"
-        raise places.problem(problem)
+        raise places.located_error(problem)
     values = _rows(
         document, sparse.field("values"), rows.dtype, (count, rows.shape[1]), is_strided=False
     )
@@ -120,7 +120,7 @@ def _rows(
         stride = document.stride(number, size)
     first = offset_of(holder, len(content))
     if count and first + (count - 1) * stride + size > len(content):
-        raise holder.problem(
+        raise holder.located_error(
             f"expected {count} elements in its buffer view, got one of {len(content)} bytes"
         )
     strided: NDArray[np.generic] = np.ndarray(

@@ -170,11 +170,11 @@ class Document:
         else:
             for name in _PACKED_VIEWS:
                 if view.has("extensions") and view.field("extensions").has(name):
-                    raise view.problem(
+                    raise view.located_error(
                         f"expected uncompressed data, got {name}, which this reader does not "
                         "support"
                     )
-            raise buffer.problem("expected a uri, got a buffer without data")
+            raise buffer.located_error("expected a uri, got a buffer without data")
         if buffer.has("byteLength"):
             limit = len(content)
             size = integer_of(buffer.field("byteLength"), f"at most {limit} bytes", 0, limit)
@@ -195,7 +195,9 @@ class Document:
         try:
             status = os.stat(path)
         except (FileNotFoundError, NotADirectoryError):
-            problem = uri.problem(f"expected the file {path.name} beside the document, got none")
+            problem = uri.located_error(
+                f"expected the file {path.name} beside the document, got none"
+            )
             raise FileNotFoundError(str(problem)) from None
         key = (status.st_dev, status.st_ino)
         if key not in self._files:

@@ -99,12 +99,14 @@ def _walk(document: Document, roots: list[int]) -> Iterator[Placement]:
         index, parent = stack.pop()
         node = document.item("nodes", index)
         if is_met[index]:
-            raise node.problem("expected at most one parent and no cycle, got a second parent")
+            raise node.located_error(
+                "expected at most one parent and no cycle, got a second parent"
+            )
         is_met[index] = True
         matrix = _product(parent, _local_matrix(node))
         if node.has("mesh"):
             if node.has("extensions") and node.field("extensions").has(_INSTANCING):
-                raise node.problem(
+                raise node.located_error(
                     f"expected one mesh, got {_INSTANCING}, which this reader does not support"
                 )
             yield Placement(document.index("meshes", node.field("mesh")), matrix, node)
@@ -125,11 +127,11 @@ def _local_matrix(node: Node) -> Floats | None:
     parts = [name for name in _PARTS if node.has(name)]
     if node.has("matrix"):
         if parts:
-            raise node.problem(f"expected a matrix or {parts[0]}, got both")
+            raise node.located_error(f"expected a matrix or {parts[0]}, got both")
         matrix = np.array(node.field("matrix").vector(16)).reshape(4, 4).T
         if not np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=1e-6):
             last = " ".join(f"{value:g}" for value in matrix[3])
-            raise node.problem(f"expected a matrix with the last row 0 0 0 1, got {last}")
+            raise node.located_error(f"expected a matrix with the last row 0 0 0 1, got {last}")
     else:
         matrix = np.eye(4)
         if node.has("rotation"):
@@ -165,13 +167,15 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
         determinant = float(np.linalg.det(rotation))
     expected = "expected a rotation, a translation and positive scales"
     if not (np.isfinite(matrix).all() and (lengths > 0).all() and np.isfinite(lengths).all()):
-        raise placement.node.problem(
+        raise placement.node.located_error(
             f"{expected}, got a scale of 0 or a number that overflows; correct the node"
         )
     if determinant < 0:
-        raise placement.node.problem(f"{expected}, got a reflection; apply it to the file first")
+        raise placement.node.located_error(
+            f"{expected}, got a reflection; apply it to the file first"
+        )
     if not abs(determinant - 1) <= _MOST_SHEAR:
-        raise placement.node.problem(f"{expected}, got a shear; apply it to the file first")
+        raise placement.node.located_error(f"{expected}, got a shear; apply it to the file first")
     scale = float(np.cbrt(lengths.prod()))
     if lengths.max() > lengths.min() * (1 + _MOST_SPREAD):
         gaussians = _stretched(gaussians, lengths)

@@ -179,7 +179,7 @@ class Primitive:
         for number in self._attributes.some_fields(()).values():
             if not has_data(self._document.item("accessors", number)):
                 name = name_text(names[0])
-                raise number.problem(
+                raise number.located_error(
                     f"expected data in a buffer, got data in {name}, which this reader does not "
                     "support"
                 )

@@ -137,7 +137,7 @@ def _extension_notes(document: Document) -> list[str]:
     for name, node in _extensions(document, "extensionsRequired"):
         if name not in READ_EXTENSIONS and not name.startswith(_OTHER_EXTENSIONS):
             text = f"expected required extensions that this reader supports, got {name_text(name)}"
-            raise node.problem(f"{text}; write the file without it")
+            raise node.located_error(f"{text}; write the file without it")
     notes = [
         f"The extension {name_text(name)} is not read."
         for name, _ in _extensions(document, "extensionsUsed")

@@ -109,13 +109,15 @@ class _Files:
         real_path = os.path.realpath(path)
         if real_path in self._chain:
             names = [*map(os.path.basename, self._chain), path.name]
-            raise node.problem(
+            raise node.located_error(
                 f"expected scenes that do not contain themselves, got {' > '.join(names)}"
             )
         if len(self._chain) >= _MOST_DEPTH:
-            raise node.problem(f"expected at most {_MOST_DEPTH} nested scenes, got more")
+            raise node.located_error(f"expected at most {_MOST_DEPTH} nested scenes, got more")
         if not path.is_file():
-            raise FileNotFoundError(str(node.problem(f"expected a scene at {path}, got none")))
+            raise FileNotFoundError(
+                str(node.located_error(f"expected a scene at {path}, got none"))
+            )
         if not is_scene(path):
             raise node.error("the name of a scene's file, which ends in .json")
         if real_path not in self._scenes:
@@ -295,7 +297,9 @@ def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
     if "matrix" not in fields:
         node.field("position")
     elif any(name in fields for name in _POSE):
-        raise node.problem("expected either matrix, or position, quaternion and scale, got both")
+        raise node.located_error(
+            "expected either matrix, or position, quaternion and scale, got both"
+        )
     subject: Bundle | Scene
     if "bundle" in fields:
         subject = _named(fields["bundle"], subjects.bundles, "bundles")
@@ -334,7 +338,7 @@ def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
                 expected = (
                     f"at most {_MOST_INSTANCES:,} instances, including those of nested scenes"
                 )
-                raise instance.node.problem(f"expected {expected}, got more")
+                raise instance.node.located_error(f"expected {expected}, got more")
             scene.add_scene(
                 inner,
                 instance.position,
@@ -413,7 +417,7 @@ def _pose_of(node: Node) -> tuple[list[float], list[float], float]:
     try:
         pose = similarity_of(rows)
     except ValueError as error:
-        raise node.problem(str(error).removeprefix("matrix: ")) from error
+        raise node.located_error(str(error).removeprefix("matrix: ")) from error
     return pose.positions[0].tolist(), pose.quaternions[0].tolist(), float(pose.scales[0])
 
 
@@ -515,7 +519,9 @@ def _read_layouts(
     layouts = list(root.field("layouts").items())
     if len(layouts) != 1:
         advice = "each layout is a scene, so split the file"
-        raise root.field("layouts").problem(f"expected one layout, got {len(layouts)}; {advice}")
+        raise root.field("layouts").located_error(
+            f"expected one layout, got {len(layouts)}; {advice}"
+        )
     top = layouts[0].some_fields(("assets", "cameras"))
     instances_of_assets: list[tuple[str, Node]] = []
     candidates: dict[str, tuple[Node, list[str]]] = {}
@@ -596,7 +602,7 @@ def _open_bundles(
         file = next((path for path in paths if path.is_file()), None)
         if file is None:
             tried = " or ".join(map(str, paths))
-            problem = node.problem(
+            problem = node.located_error(
                 f"expected a bundle at {tried}, got no file; build it with `v3dg build`"
             )
             raise FileNotFoundError(str(problem))

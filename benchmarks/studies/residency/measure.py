@@ -3,12 +3,12 @@ different copies.
 
 Copies of a bundle are written with slightly different colours of all gaussians, so that
 no two copies share a page. They are placed in a grid. Pools have several sizes,
-relative to the memory that a view needs, and the files are in the system's cache or
-not. The study measures the time of frames, the bytes read, the number of missing pages,
-and the error against the settled picture. After a teleport, it also measures the errors
-of both pictures against all gaussians at 4 x 4 samples per pixel. The row without a
-pool shows the frames when everything is resident. On a GPU, rows also have the device
-memory of the process.
+relative to the memory that a view needs. Runs begin with or without the files in the
+system's cache. The study measures the time of frames, the bytes read, the number of
+missing pages, and the error against the settled picture. After a teleport, it also
+measures the errors of both pictures against all gaussians at 4 x 4 samples per pixel.
+The row without a pool shows the frames when everything is resident. On a GPU, rows also
+have the device memory of the process.
 """
 
 from __future__ import annotations

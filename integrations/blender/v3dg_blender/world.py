@@ -166,7 +166,7 @@ def nearest_similarities(matrices: Floats) -> Floats:
     return result
 
 
-def similarity_problem(matrix: Floats) -> str | None:
+def reason_against_similarity(matrix: Floats) -> str | None:
     """Return the reason why a matrix (4, 4) is not a similarity, or None."""
     linear = matrix[:3, :3]
     size = float(np.linalg.norm(linear, axis=0).max())
@@ -273,11 +273,11 @@ def as_scene(items: Iterable[Placed]) -> v3dg.Scene:
     """
     items = list(items)
     for item in items:
-        problem = similarity_problem(item.matrix)
-        if problem is not None:
+        reason = reason_against_similarity(item.matrix)
+        if reason is not None:
             raise ValueError(
                 f"{item.source.name}: expected a rotation, a translation and one positive scale, "
-                f"got {problem}; use the same scale along all axes"
+                f"got {reason}; use the same scale along all axes"
             )
     scene = v3dg.Scene()
     scene.up = "z"

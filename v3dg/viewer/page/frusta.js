@@ -27,7 +27,7 @@ const HOVER_PX = 14;
 
 export class Frusta {
   /**
-   * Small photographs, by the index of the camera.
+   * Thumbnails of the photographs, by the index of the camera.
    *
    * @type {Map<number, HTMLImageElement>}
    */
