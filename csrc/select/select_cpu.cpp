@@ -109,9 +109,7 @@ struct SeenInstance {
         const ClusterRuns& runs = of.runs[of.in.instances.bundle[i]];
         Asked asked{{0, static_cast<uint32_t>(table.num_clusters())},
                     {0, static_cast<uint32_t>(table.ball.size)}};
-        // A budget assumes that all pages are resident.
-        const bool is_whole = table.pages.is_whole() || tolerances == Tolerances::from_this_on;
-        if (runs.count == 0 || !is_whole) return asked;
+        if (runs.count == 0) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
         // If most clusters must be tested, they belong to most groups. Finding the
         // range of these groups would then cost more than testing all groups.
@@ -196,15 +194,16 @@ void raise(uint32_t& need, float priority) {
     }
 }
 
-// Records which pages an instance needs. `needs` has one element per page.
+// Records which pages an instance needs. `needs` has one element per page. Clusters
+// that need not be tested need no page, because their parent groups fit.
 template <class Cut>
-void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs,
+void tell_needs(const Cut& cut, const SelectRule& rule, const Asked& asked, Span<uint32_t> needs,
                 std::vector<float>& priority) {
     const ClusterTable& table = cut.table;
-    for (size_t g = 0; g < table.ball.size; ++g)
+    for (size_t g = asked.groups.first; g < asked.groups.end; ++g)
         priority[g] =
             priority_of(wanted_metric_px2(table, static_cast<int32_t>(g), cut.view, rule), rule);
-    for (size_t c = 0; c < table.num_clusters(); ++c) {
+    for (size_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
         const PageNeed need = page_need(table, c, [&](int32_t g) { return priority[g]; });
         if (need.page >= 0 && !cut.is_culled(c)) raise(needs[need.page], need.priority);
     }
@@ -227,7 +226,8 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
         ask_groups(seen, rule, asked.groups, refinement);
         end += find_sufficient(seen.table, seen.view, rule, asked.clusters, refinement, chosen);
         if (!view.in.needs.empty() && !seen.table.pages.is_whole())
-            tell_needs(cut, rule, view.in.needs[view.in.instances.bundle[i]], scratch.priority);
+            tell_needs(cut, rule, asked, view.in.needs[view.in.instances.bundle[i]],
+                       scratch.priority);
     }
     if (cut.culls) end = std::remove_if(chosen, end, [&](int32_t c) { return cut.is_culled(c); });
     out.instance.insert(out.instance.end(), end - chosen, static_cast<int32_t>(i));
