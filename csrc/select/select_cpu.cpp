@@ -17,6 +17,10 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
+// guess_bin() is right to about half an octave, mostly too low by an octave. If the
+// guess was too high, it is lowered by an octave, and then further.
+constexpr uint32_t kOctave = 1u << kLog2StepsPerOctave;
+constexpr uint32_t kExactBins = kOctave / 16, kBinsOfExcess = kOctave / 2;
 // From this number of instances on, the runs of a bundle are computed. Computing the
 // runs costs about as much as processing one instance.
 constexpr size_t kManyInstances = 16;
@@ -105,7 +109,7 @@ struct SeenInstance {
         const ClusterRuns& runs = of.runs[of.in.instances.bundle[i]];
         Asked asked{{0, static_cast<uint32_t>(table.num_clusters())},
                     {0, static_cast<uint32_t>(table.ball.size)}};
-        if (runs.count == 0 || !table.pages.is_whole()) return asked;
+        if (runs.count == 0) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
         // If most clusters must be tested, they belong to most groups. Finding the
         // range of these groups would then cost more than testing all groups.
@@ -190,15 +194,16 @@ void raise(uint32_t& need, float priority) {
     }
 }
 
-// Records which pages an instance needs. `needs` has one element per page.
+// Records which pages an instance needs. `needs` has one element per page. Clusters
+// that need not be tested need no page, because their parent groups fit.
 template <class Cut>
-void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs,
+void tell_needs(const Cut& cut, const SelectRule& rule, const Asked& asked, Span<uint32_t> needs,
                 std::vector<float>& priority) {
     const ClusterTable& table = cut.table;
-    for (size_t g = 0; g < table.ball.size; ++g)
+    for (size_t g = asked.groups.first; g < asked.groups.end; ++g)
         priority[g] =
             priority_of(wanted_metric_px2(table, static_cast<int32_t>(g), cut.view, rule), rule);
-    for (size_t c = 0; c < table.num_clusters(); ++c) {
+    for (size_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
         const PageNeed need = page_need(table, c, [&](int32_t g) { return priority[g]; });
         if (need.page >= 0 && !cut.is_culled(c)) raise(needs[need.page], need.priority);
     }
@@ -221,7 +226,8 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
         ask_groups(seen, rule, asked.groups, refinement);
         end += find_sufficient(seen.table, seen.view, rule, asked.clusters, refinement, chosen);
         if (!view.in.needs.empty() && !seen.table.pages.is_whole())
-            tell_needs(cut, rule, view.in.needs[view.in.instances.bundle[i]], scratch.priority);
+            tell_needs(cut, rule, asked, view.in.needs[view.in.instances.bundle[i]],
+                       scratch.priority);
     }
     if (cut.culls) end = std::remove_if(chosen, end, [&](int32_t c) { return cut.is_culled(c); });
     out.instance.insert(out.instance.end(), end - chosen, static_cast<int32_t>(i));
@@ -234,14 +240,17 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     });
 }
 
-// Adds the cut of instance i to `change`. For each bin, this adds the number of
-// gaussians by which the cut differs from that of the bin before. `bins` must have room
-// for all groups.
-void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
+// Adds the cuts of instance i from a bin on to `change`: for each bin, the number of
+// gaussians by which the cut differs from that of the bin before. In bins before the
+// first one, clusters may be missing whose numbers cancel out until the first bin.
+// `bins` must have room for all groups.
+void count_instance(const View& view, size_t i, uint32_t first_bin, std::vector<GroupBins>& bins,
                     std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
+    SelectRule coarsest = rule;
+    coarsest.tolerance_px2 = tolerance_of_bin(first_bin, rule.tolerance_px2);
     const SeenInstance seen(view, i);
-    const CutSource source = seen.source(rule);
+    const CutSource source = seen.source(coarsest);
     if (source == CutSource::nowhere) return;
     const auto cut = seen.cut(rule, KnownBins{bins.data()});
     if (source == CutSource::tops) {
@@ -250,10 +259,12 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
         return;
     }
     const AskedGroups groups = seen.groups(rule);
-    const Asked asked = seen.asked(view, i, rule, Tolerances::from_this_on);
+    const Asked asked = seen.asked(view, i, coarsest, Tolerances::from_this_on);
     for (uint32_t g = asked.groups.first; g < asked.groups.end; ++g) {
         const auto group = static_cast<int32_t>(g);
-        bins[g] = {groups.first_fitting(group), groups.first_unrefined(group)};
+        const uint32_t fitting = groups.first_fitting(group);
+        // Without a fade, both factors are 1.
+        bins[g] = {fitting, rule.fade.is_on() ? groups.first_unrefined(group) : fitting};
     }
     for (size_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
         const BinRange range = cut.bins(c);
@@ -263,37 +274,99 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
     }
 }
 
-// Several arrays. For each bin, their sum is the number of gaussians by which the cut
-// differs from that of the bin before.
+// Several arrays, one for each thread. For each bin, their sum is the number of
+// gaussians by which the cut differs from that of the bin before; see count_instance().
 using BinChanges = std::vector<std::vector<int64_t>>;
-BinChanges count_changes(const View& view) {
+BinChanges count_changes(const View& view, uint32_t first_bin) {
     const size_t num_instances = view.in.instances.bundle.size;
-    // Part p has the instances p, p + kBudgetParts, and so on. Consecutive instances
-    // cost about the same, so this balances the load.
-    BinChanges changes(std::min(kBudgetParts, num_instances));
+    const size_t num_parts =
+        most_threads() == 1 ? 1 : kBudgetParts;  // an array is as large as half a megabyte
+    // Part p has the instances p, p + num_parts, and so on. Consecutive instances cost
+    // about the same, so this balances the load.
+    BinChanges changes(std::min(num_parts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);
         std::vector<GroupBins> bins(view.most_groups);
         for (size_t i = part; i < num_instances; i += changes.size())
-            count_instance(view, i, bins, changes[part]);
+            count_instance(view, i, first_bin, bins, changes[part]);
     });
     return changes;
 }
 
+// The number of gaussians of one instance, by a rough model: `area` divided by the
+// tolerance, but between the numbers of its coarsest level and of all levels.
+struct CountModel {
+    float area, least, most;
+};
+
+CountModel model_of(const View& view, size_t i) {
+    const SeenInstance seen(view, i);
+    if (seen.source(view.in.rule) == CutSource::nowhere) return {0, 0, 0};
+    CountModel model{0, 0, static_cast<float>(seen.table.offset[seen.table.num_clusters()])};
+    for (const int32_t c : seen.table.top_cluster) {
+        const auto count = static_cast<float>(seen.table.num_gaussians(c));
+        const int32_t group = seen.table.own_group[c];
+        model.least += count;
+        if (group >= 0)
+            model.area += count * wanted_metric_px2(seen.table, group, seen.view, view.in.rule);
+    }
+    return model;
+}
+
+// Guesses a bin at which the cut has more gaussians than the budget, but not many more.
+// Only the time of meet_budget() depends on the guess.
+uint32_t guess_bin(const View& view, uint64_t budget) {
+    std::vector<CountModel> models(view.in.instances.bundle.size);
+    parallel_for(models.size(), kChunk, [&](size_t i) { models[i] = model_of(view, i); });
+    uint32_t first = 0, end = kNumBudgetBins - 1;
+    while (end - first > kExactBins) {
+        const uint32_t middle = first + (end - first) / 2;
+        const float inverse = 1 / tolerance_of_bin(middle, view.in.rule.tolerance_px2);
+        double count = 0;
+        for (const CountModel& model : models)
+            count += std::max(model.least, std::min(model.area * inverse, model.most));
+        (count > static_cast<double>(budget) ? first : end) = middle;
+    }
+    return std::min(first + kBinsOfExcess, end);
+}
+
+// The first bins from which on no cut has more gaussians than the budget, and than its
+// goal, and the number of gaussians in the cut of the last bin.
+struct BudgetBins {
+    uint32_t least, goal;
+    int64_t last_count;
+};
+
+BudgetBins bins_of_budget(const View& view, uint64_t budget, uint32_t first_bin) {
+    const BinChanges changes = count_changes(view, first_bin);
+    const uint64_t goal_count = goal_of_budget(budget);
+    BudgetBins bins{first_bin, first_bin, 0};
+    for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
+        for (const std::vector<int64_t>& change : changes) bins.last_count += change[bin];
+        if (bin < first_bin) continue;
+        if (static_cast<uint64_t>(bins.last_count) > budget) bins.least = bin + 1;
+        if (static_cast<uint64_t>(bins.last_count) > goal_count) bins.goal = bin + 1;
+    }
+    return bins;
+}
+
 // Sets the tolerance of `rule` to meet its budget. Returns whether any cut fits. If
 // none fits, `least_count` receives the number of gaussians in the coarsest cut.
+//
+// Counting from a bin on costs less the larger the bin is. The result is exact if a cut
+// from that bin on exceeds the budget, because it depends on the last such cut only.
 bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
-    const BinChanges changes = count_changes(view);
-    const uint64_t goal_count = goal_of_budget(rule.budget);
-    uint32_t least = 0, goal = 0, none = kNoBin;
-    for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
-        for (const std::vector<int64_t>& change : changes) least_count += change[bin];
-        if (static_cast<uint64_t>(least_count) > rule.budget) least = bin + 1;
-        if (static_cast<uint64_t>(least_count) > goal_count) goal = bin + 1;
+    uint32_t first_bin = guess_bin(view, rule.budget);
+    BudgetBins bins = bins_of_budget(view, rule.budget, first_bin);
+    for (uint32_t further = kOctave; first_bin > 0 && bins.least == first_bin; further *= 4) {
+        first_bin -= std::min(first_bin, further);
+        bins = bins_of_budget(view, rule.budget, first_bin);
     }
-    if (least == kNumBudgetBins) return false;
+    least_count = bins.last_count;
+    if (bins.least == kNumBudgetBins) return false;
+    uint32_t none = kNoBin;
     uint32_t* last = view.in.last_bin == nullptr ? &none : view.in.last_bin;
-    rule.tolerance_px2 = tolerance_of_budget(rule, least, goal, *last);
+    rule.tolerance_px2 = tolerance_of_budget(rule, bins.least, bins.goal, *last);
     return true;
 }
 
@@ -350,7 +423,7 @@ void cpu::choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets,
                             Span<BudgetCut> chosen) {
     View view(in);
     view.find_runs();
-    const BinChanges changes = count_changes(view);
+    const BinChanges changes = count_changes(view, 0);
     // A bin at which the number of gaussians changes. There are few of these.
     struct Step {
         uint32_t bin;

@@ -45,10 +45,18 @@ const kWindow_px = vec2u(8u, 4u);
 const kPixelsOfWindow = 32u;
 const kWordsOfBatch = kThreads / 32u;
 
-// The gaussians of a batch: the centre relative to the tile, l11 and l12; l22 and the
-// opacity; the colour.
-var<workgroup> batch_center_l1: array<vec4f, kThreads>;
-var<workgroup> batch_l22_opacity: array<vec2f, kThreads>;
+// The gaussians of a batch. At a place in the tile, L d is
+// (l11 x + l12 y + first, l22 y + second).
+struct Falloff {
+  l11: f32,
+  l12: f32,
+  l22: f32,
+  first: f32,
+  second: f32,
+  log2_opacity: f32,
+}
+
+var<workgroup> batch_falloff: array<Falloff, kThreads>;
 var<workgroup> batch_color: array<vec3f, kThreads>;
 // Bits of the windows that a gaussian reaches.
 var<workgroup> batch_windows: array<u32, kThreads>;
@@ -78,8 +86,9 @@ fn load(thread: u32, gaussian: u32, origin: vec2f) {
   let center = record.center - origin;
   let l = vec3f(record.l11, record.l12, record.l22);
   let reach = max(record.log2_opacity - kLog2MinAlpha, 0.0);
-  batch_center_l1[thread] = vec4f(center, l.xy);
-  batch_l22_opacity[thread] = vec2f(l.z, record.log2_opacity);
+  let first = -dot(l.xy, center);
+  let second = -l.z * center.y;
+  batch_falloff[thread] = Falloff(l.x, l.y, l.z, first, second, record.log2_opacity);
   let blue = unpack2x16float(record.blue_tiles).x;
   batch_color[thread] = vec3f(unpack2x16float(record.red_green), blue);
   batch_windows[thread] = windows_of(center, l, reach);
@@ -102,28 +111,31 @@ struct Pixel {
   is_live: bool,
 }
 
+// Blends one gaussian of the batch. Returns whether the pixel stops behind it.
+fn blend_one(pixel: ptr<function, Pixel>, place: vec2f, index: u32) -> bool {
+  let falloff = batch_falloff[index];
+  let t1 = falloff.l11 * place.x + (falloff.l12 * place.y + falloff.first);
+  let t2 = falloff.l22 * place.y + falloff.second;
+  let exponent = falloff.log2_opacity - t2 * t2 - t1 * t1;
+  if (exponent < kLog2MinAlpha) {
+    return false;
+  }
+  let weight = min(exp2(exponent), kMaxAlpha) * (*pixel).transmittance;
+  (*pixel).color += weight * batch_color[index];
+  (*pixel).transmittance -= weight;
+  return (*pixel).transmittance <= camera.min_transmittance;
+}
+
 // Blends the gaussians of the batch that reach the pixel's window.
-fn blend_batch(pixel: ptr<function, Pixel>, center: vec2f, window: u32) {
+fn blend_batch(pixel: ptr<function, Pixel>, place: vec2f, window: u32) {
   for (var word = 0u; word < kWordsOfBatch; word++) {
     var bits = window_gaussians[window * kWordsOfBatch + word];
     while (bits != 0u) {
-      let k = 32u * word + firstTrailingBit(bits);
-      bits &= bits - 1u;
-      let center_l1 = batch_center_l1[k];
-      let l22_opacity = batch_l22_opacity[k];
-      let d = center - center_l1.xy;
-      let t1 = center_l1.z * d.x + center_l1.w * d.y;
-      let t2 = l22_opacity.x * d.y;
-      let exponent = l22_opacity.y - t2 * t2 - t1 * t1;
-      if (exponent >= kLog2MinAlpha) {
-        let weight = min(exp2(exponent), kMaxAlpha) * (*pixel).transmittance;
-        (*pixel).color += weight * batch_color[k];
-        (*pixel).transmittance -= weight;
-        if ((*pixel).transmittance <= camera.min_transmittance) {
-          (*pixel).is_live = false;
-          return;
-        }
+      if (blend_one(pixel, place, 32u * word + firstTrailingBit(bits))) {
+        (*pixel).is_live = false;
+        return;
       }
+      bits &= bits - 1u;
     }
   }
 }

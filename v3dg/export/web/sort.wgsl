@@ -4,7 +4,7 @@
 
 struct Pass {
   shift: u32,
-  num_tiles: u32,
+  num_tiles: u32,  // for which `counts` has room
   // Keys are replaced by this number of bits of their distance from the lowest key; 0
   // keeps keys as they are.
   bits: u32,
@@ -47,6 +47,9 @@ fn count_digits(
   @builtin(workgroup_id) tile: vec3u,
   @builtin(local_invocation_index) thread: u32,
 ) {
+  if (tile.x * kTile >= sizes.num_keys) {
+    return;
+  }
   for (var digit = thread; digit < kDigits; digit += kThreads) {
     atomicStore(&histogram[digit], 0u);
   }
@@ -92,10 +95,11 @@ fn sum_counts(
   @builtin(workgroup_id) digit: vec3u,
   @builtin(local_invocation_index) thread: u32,
 ) {
-  let share = (sorting.num_tiles + kThreads - 1u) / kThreads;
+  let num_tiles = (sizes.num_keys + kTile - 1u) / kTile;
+  let share = (num_tiles + kThreads - 1u) / kThreads;
   let row = digit.x * sorting.num_tiles;
-  let first = row + min(thread * share, sorting.num_tiles);
-  let end = min(first + share, row + sorting.num_tiles);
+  let first = row + min(thread * share, num_tiles);
+  let end = min(first + share, row + num_tiles);
   var sum = 0u;
   for (var k = first; k < end; k++) {
     sum += counts[k];
