@@ -153,11 +153,11 @@ std::vector<int64_t> RayFrame::cast(const Subject& subject, const RaySensor& sen
     const double K[9] = {focal, 0, 0, 0, focal, 0, 0, 0, 1};
     const CameraArrays arrays{.viewmats = poses.viewmats,
                               .intrinsics = intrinsics_.copy_from({K, 9}, stream),
-                              .environments = nullptr,
+                              .environments = poses.environments,
                               .are_viewmats_double = poses.are_double,
                               .are_intrinsics_double = true,
                               .shares_intrinsics = true,
-                              .are_environments_long = false,
+                              .are_environments_long = poses.are_environments_long,
                               .width = 1,
                               .height = 1,
                               .near_depth = sensor.limits.nearest};
@@ -233,7 +233,10 @@ std::vector<int64_t> RayFrame::cast_part(const Subject& subject, const RaySensor
                                          const RayPlanes& planes, cudaStream_t stream) {
     const RayDirections& rays = grid_.load(sensor.grid, stream);
     const bool is_scene = subject.scene != nullptr;
-    const SeenBounds seen = is_scene ? subject.scene->seen_by_all() : SeenBounds{1, 1};
+    SeenBounds seen{1, 1};
+    if (is_scene)
+        seen = poses.environments == nullptr ? subject.scene->seen_by_all()
+                                             : subject.scene->seen_in_environment();
     const size_t num_slots = is_scene ? batch_slots(seen.instances) : 1;
     const size_t num_zeros = Cut::num_batch_zeros(num_slots * count);
     const size_t num_before = sizeof(Counts) + num_zeros * sizeof(unsigned long long);

@@ -339,6 +339,44 @@ def test_several_poses_are_several_scans(device):
         batch[5]
 
 
+def part_of(scene, environment):
+    """Return the shared instances, then those of an environment."""
+    shared = np.flatnonzero(scene.environments == -1)
+    own = np.flatnonzero((scene.environments == environment) & (environment >= 0))
+    rows = np.concatenate([shared, own])
+    part = Scene()
+    part.add(
+        [scene.bundles[number] for number in scene.instance_bundle[rows]],
+        scene.positions[rows],
+        scene.quaternions[rows],
+        scene.scales[rows],
+    )
+    return part
+
+
+def test_a_sensor_sees_its_environment_and_what_is_shared(device):
+    rng = np.random.default_rng(20)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 24, spread=3)
+    scene.set_environment(rng.permutation(np.repeat([-1, 0, 1, 3], 6)))
+    poses = np.stack([pose_of(rng, rng.normal(size=3)) for _ in range(5)])
+    environment = [0, 3, -1, 2, 1]
+    batch = v3dg.scan(scene, LIDAR, poses, environment=environment, device=device)
+    alone = [
+        v3dg.scan(part_of(scene, number), LIDAR, pose, device=device)
+        for number, pose in zip(environment, poses, strict=True)
+    ]
+    one = v3dg.scan(scene, LIDAR, poses[1], environment=3, device=device)
+    same = v3dg.scan(scene, LIDAR, poses[:2], environment=3, device=device)
+    assert batch.gaussians == [scan.gaussians for scan in alone]
+    for name in PLANES:
+        expected = np.stack([host(getattr(scan, name)) for scan in alone])
+        np.testing.assert_array_equal(host(getattr(batch, name)), expected, err_msg=name)
+        np.testing.assert_array_equal(host(getattr(one, name)), expected[1], err_msg=name)
+        np.testing.assert_array_equal(host(getattr(same, name))[1], expected[1], err_msg=name)
+    everything = v3dg.scan(scene, LIDAR, poses[0], device=device)
+    assert everything.gaussians > alone[0].gaussians
+
+
 def test_many_hits_at_one_place_are_blended_in_order(device):
     """More gaussians than a window holds reach from the eye to beyond the wall, so that
     nothing is certain to be in front of anything."""
@@ -377,6 +415,11 @@ def test_opaque_rays_end_behind_a_small_share_of_the_light(device):
     assert np.isinf(scanned.second_range).all()
 
 
+def some_bundle():
+    rng = np.random.default_rng(21)
+    return lod_bundle(rng, blob(rng, 40), 16)
+
+
 ERRORS = {
     "azimuth: expected 1 to": lambda: Lidar(np.zeros((2, 2)), np.zeros(1)),
     "azimuth: expected finite": lambda: Lidar(np.array([math.nan]), np.zeros(1)),
@@ -391,6 +434,15 @@ ERRORS = {
     "pose: expected a rotation": lambda: v3dg.scan(dot((1, 0, 0)), LIDAR, np.diag([1.0, 1, -1, 1])),
     "pose[1]: expected the last row": lambda: v3dg.scan(
         dot((1, 0, 0)), LIDAR, [np.eye(4), np.ones((4, 4))]
+    ),
+    "environment: expected None for an asset": lambda: v3dg.scan(
+        dot((1, 0, 0)), LIDAR, np.eye(4), environment=-1
+    ),
+    "environment: expected 1 whole numbers": lambda: v3dg.scan(
+        some_bundle(), LIDAR, np.eye(4), environment=[0, 0]
+    ),
+    "environment[0]: expected -1 to -1, as the scene has, got 0": lambda: v3dg.scan(
+        some_bundle(), LIDAR, np.eye(4), environment=0
     ),
     "budget: expected none": lambda: v3dg.render(
         dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), budget=3
@@ -470,6 +522,28 @@ def test_poses_on_the_device_are_read_there():
     assert np.isclose(host(single.alpha), host(expected.alpha)[0], atol=1e-3).mean() > 0.99
     with pytest.raises(ValueError, match=r"^pose: expected a tensor on cpu"):
         v3dg.scan(scene, LIDAR, tensor, device="cpu")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dtype", ["int32", "int64"])
+def test_environments_on_the_device_are_read_there(dtype):
+    import torch
+
+    rng = np.random.default_rng(22)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 12, spread=3)
+    scene.set_environment(np.arange(12) % 3)
+    poses = torch.tensor(np.stack([pose_of(rng, rng.normal(size=3)) for _ in range(3)])).cuda()
+    expected = v3dg.scan(scene, LIDAR, poses, environment=[2, 0, 1], device="cuda")
+    numbers = torch.tensor([2, 0, 1], dtype=getattr(torch, dtype), device="cuda")
+    made = v3dg.scan(scene, LIDAR, poses, environment=numbers, device="cuda")
+    np.testing.assert_array_equal(host(made.alpha), host(expected.alpha))
+    assert host(made.alpha).max() > 0.5
+    numbers[1] = 7
+    broken = v3dg.scan(scene, LIDAR, poses, environment=numbers, device="cuda")
+    assert host(broken.alpha)[1].max() == 0
+    np.testing.assert_array_equal(host(broken.alpha)[[0, 2]], host(expected.alpha)[[0, 2]])
+    with pytest.raises(ValueError, match=r"^environment: expected int32 or int64"):
+        v3dg.scan(scene, LIDAR, poses, environment=numbers.float(), device="cuda")
 
 
 @pytest.mark.gpu
