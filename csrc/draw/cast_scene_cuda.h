@@ -12,8 +12,8 @@ namespace v3dg {
 namespace cuda {
 
 // Poses on the device: (B, 4, 4) from the world to the sensor, and the environments
-// that it sees there. At a pose that is no rigid motion, or with an environment that the
-// scene does not have, the sensor sees nothing.
+// that it sees there. At a pose that is no rigid motion, or with an environment that
+// the scene does not have, the sensor sees nothing.
 struct RayPoses {
     const void* viewmats;
     bool are_double;
