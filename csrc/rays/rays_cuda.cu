@@ -14,8 +14,6 @@
 
 #include "rays/rays_cuda.h"
 
-#include <cuda_pipeline.h>
-
 #include <algorithm>
 #include <bit>
 #include <cub/device/device_radix_sort.cuh>
@@ -45,8 +43,6 @@ constexpr unsigned kWindow = 16;
 constexpr unsigned kLoaded = 32;
 // The rays of a warp in a tile.
 constexpr int kWarpColumns = 8, kWarpRows = 4;
-// The vectors of a record.
-constexpr unsigned kVectors = sizeof(RayRecord) / sizeof(float4);
 static_assert(kWarpColumns * kWarpRows == 32 && kRayTileColumns % kWarpColumns == 0 &&
                   kRayTileRows % kWarpRows == 0,
               "warps divide a tile into rectangles");
@@ -275,32 +271,28 @@ struct HitKey {
     }
 };
 
-// A hit in the window of a ray. `light` is the luma of the gaussian's colour or, where
-// colours are blended, the index of the record.
-struct WindowHit {
-    float range, alpha;
-    uint32_t order, light;
-
-    __device__ HitKey key() const { return {range, order}; }
-};
-
 // The nearest hits of the rays of a block that are not blended yet, each ray's in
 // ascending order in a ring. Neighbouring threads use neighbouring banks.
 struct Windows {
     float range[kWindow][kRayTileSize], alpha[kWindow][kRayTileSize];
-    uint32_t order[kWindow][kRayTileSize], light[kWindow][kRayTileSize];
+    uint32_t record[kWindow][kRayTileSize];
 };
 
 // The window of one ray.
 class RayWindow {
   public:
-    __device__ explicit RayWindow(Windows& memory) : memory_(memory) {}
+    __device__ RayWindow(Windows& memory, const RayRecord* records)
+        : memory_(memory), records_(records) {}
 
     __device__ unsigned size() const { return size_; }
     __device__ float nearest() const { return memory_.range[at(0)][threadIdx.x]; }
-    __device__ WindowHit hit(unsigned k) const {
+    __device__ TileHit hit(unsigned k) const {
         return {memory_.range[at(k)][threadIdx.x], memory_.alpha[at(k)][threadIdx.x],
-                memory_.order[at(k)][threadIdx.x], memory_.light[at(k)][threadIdx.x]};
+                memory_.record[at(k)][threadIdx.x]};
+    }
+    __device__ HitKey key(unsigned k) const {
+        return {memory_.range[at(k)][threadIdx.x],
+                __ldg(&records_[memory_.record[at(k)][threadIdx.x]].order)};
     }
     __device__ void drop_nearest() {
         first_ = (first_ + 1) % kWindow;
@@ -308,12 +300,12 @@ class RayWindow {
     }
     __device__ void drop_farthest() { --size_; }
     // Inserts a hit. The window is not full.
-    __device__ void insert(const WindowHit& hit) {
+    __device__ void insert(const TileHit& hit, uint32_t order) {
         unsigned k = size_;
         for (; k > 0; --k) {
-            const WindowHit before = this->hit(k - 1);
-            if (before.key() < hit.key()) break;
-            set(k, before);
+            const float before = memory_.range[at(k - 1)][threadIdx.x];
+            if (before < hit.range || (before == hit.range && key(k - 1).order < order)) break;
+            set(k, this->hit(k - 1));
         }
         set(k, hit);
         ++size_;
@@ -322,98 +314,29 @@ class RayWindow {
 
   private:
     __device__ unsigned at(unsigned k) const { return (first_ + k) % kWindow; }
-    __device__ void set(unsigned k, const WindowHit& hit) {
+    __device__ void set(unsigned k, const TileHit& hit) {
         memory_.range[at(k)][threadIdx.x] = hit.range;
         memory_.alpha[at(k)][threadIdx.x] = hit.alpha;
-        memory_.order[at(k)][threadIdx.x] = hit.order;
-        memory_.light[at(k)][threadIdx.x] = hit.light;
+        memory_.record[at(k)][threadIdx.x] = hit.record;
     }
 
     Windows& memory_;
-    unsigned first_ = 0, size_ = 0;
-};
-
-// The entries of a tile on their way through shared memory, kLoaded at a time: while a
-// batch is blended, the records of the next one and the keys of the one behind it are
-// copied. Batch b of the tile has the keys b % 3 and the records b % 2.
-class EntryBatches {
-  public:
-    struct Memory {
-        float4 records[2][kLoaded][kVectors];
-        uint64_t keys[3][kLoaded];
-    };
-    __device__ EntryBatches(Memory& memory, const RayRecord* records, const uint64_t* entries,
-                            uint32_t begin, uint32_t end)
-        : memory_(memory), records_(records), entries_(entries), begin_(begin), end_(end) {}
-
-    __device__ uint32_t size(uint32_t b) const {
-        const uint32_t first = begin_ + b * kLoaded;
-        return first < end_ ? min(kLoaded, end_ - first) : 0;
-    }
-    __device__ uint64_t key(uint32_t b, unsigned k) const { return memory_.keys[b % 3][k]; }
-    __device__ const RayRecord& record(uint32_t b, unsigned k) const {
-        return *reinterpret_cast<const RayRecord*>(memory_.records[b % 2][k]);
-    }
-    // Copies the first two batches. All threads of the block must call it.
-    __device__ void start() {
-        copy_keys(0);
-        copy_keys(1);
-        __pipeline_commit();
-        __pipeline_wait_prior(0);
-        __syncthreads();
-        copy_records(0);
-        __pipeline_commit();
-    }
-    // Waits for this thread's copies of the batch. The caller then waits for the other
-    // threads.
-    __device__ void wait() { __pipeline_wait_prior(0); }
-    // Begins to copy what the batch behind this one needs.
-    __device__ void copy_behind(uint32_t b) {
-        copy_records(b + 1);
-        copy_keys(b + 2);
-        __pipeline_commit();
-    }
-
-  private:
-    __device__ void copy_keys(uint32_t b) {
-        if (threadIdx.x < size(b))
-            __pipeline_memcpy_async(&memory_.keys[b % 3][threadIdx.x],
-                                    entries_ + begin_ + b * kLoaded + threadIdx.x,
-                                    sizeof(uint64_t));
-    }
-    __device__ void copy_records(uint32_t b) {
-        for (unsigned v = threadIdx.x; v < size(b) * kVectors; v += kRayTileSize) {
-            const auto index = static_cast<uint32_t>(key(b, v / kVectors));
-            __pipeline_memcpy_async(
-                &memory_.records[b % 2][v / kVectors][v % kVectors],
-                reinterpret_cast<const float4*>(records_ + index) + v % kVectors, sizeof(float4));
-        }
-    }
-
-    Memory& memory_;
     const RayRecord* records_;
-    const uint64_t* entries_;
-    uint32_t begin_, end_;
+    unsigned first_ = 0, size_ = 0;
 };
 
 // The light of one ray: colour and mean range, or returns.
 template <bool kReturns>
 class RayLight {
   public:
-    __device__ RayLight(const ReturnRule& rule, const RayRecord* records) : records_(records) {
+    __device__ RayLight(const ReturnRule& rule) {
         if constexpr (kReturns) returns_.start(rule);
     }
-    // Returns WindowHit::light of a record.
-    static __device__ uint32_t light_of(const RayRecord& record, uint32_t index) {
-        if constexpr (kReturns) return __float_as_uint(luma_of(record.color));
-        return index;
-    }
-    __device__ void add(const WindowHit& hit, float transmittance) {
+    __device__ void add(const TileHit& hit, const float rgb[3], float transmittance) {
         const float weight = hit.alpha * transmittance;
         if constexpr (kReturns) {
-            returns_.add({hit.range, weight, __uint_as_float(hit.light)}, transmittance);
+            returns_.add({hit.range, weight, luma_of(rgb)}, transmittance);
         } else {
-            const float* rgb = records_[hit.light].color;
             for (int c = 0; c < 3; ++c) color_[c] += weight * rgb[c];
             weighted_range_ += weight * hit.range;
         }
@@ -434,7 +357,6 @@ class RayLight {
 
   private:
     struct Nothing {};
-    const RayRecord* records_;
     std::conditional_t<kReturns, ReturnFinder, Nothing> returns_;
     float color_[3] = {0, 0, 0}, weighted_range_ = 0;
 };
@@ -445,7 +367,8 @@ __global__ void __launch_bounds__(kRayTileSize)
     cast_kernel(RayLists lists, const uint64_t* entries, const uint32_t* first, RayDirections rays,
                 RayLimits limits, RayPlanes planes) {
     __shared__ Windows windows;
-    __shared__ EntryBatches::Memory memory;
+    __shared__ float4 loaded[kLoaded][sizeof(RayRecord) / sizeof(float4)];
+    __shared__ uint64_t keys[kLoaded + 1];
     const unsigned num_tiles = static_cast<unsigned>(rays.num_tiles());
     const unsigned image = blockIdx.x / num_tiles, tile = blockIdx.x % num_tiles;
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
@@ -461,14 +384,14 @@ __global__ void __launch_bounds__(kRayTileSize)
     const float y = rays.elevation_cosine[row] * rays.azimuth_sine[column];
     const float z = rays.elevation_sine[row];
 
-    EntryBatches batches(memory, lists.records, entries, first[blockIdx.x], first[blockIdx.x + 1]);
+    const uint32_t begin = first[blockIdx.x], end = first[blockIdx.x + 1];
     const uint32_t code_mask = (1u << lists.distance_bits) - 1;
     const auto bound_of = [&](uint64_t key) {
         return distance_of_code(static_cast<uint32_t>(key >> 32) & code_mask, limits.nearest,
                                 lists.distance_bits);
     };
-    RayWindow window(windows);
-    RayLight<kReturns> light(planes.rule, lists.records);
+    RayWindow window(windows, lists.records);
+    RayLight<kReturns> light(planes.rule);
     float transmittance = 1;
     bool is_over = !is_ray;
     // Hits in front of `from` are blended. Hits from `limit` on wait for another pass.
@@ -477,17 +400,17 @@ __global__ void __launch_bounds__(kRayTileSize)
 
     const auto blend_before = [&](float range) {
         while (window.size() > 0 && window.nearest() < range) {
-            const WindowHit hit = window.hit(0);
+            const TileHit hit = window.hit(0);
             window.drop_nearest();
-            light.add(hit, transmittance);
+            light.add(hit, lists.records[hit.record].color, transmittance);
             transmittance *= 1 - hit.alpha;
             if (!(transmittance < limits.min_transmittance)) continue;
             is_over = true;
             window.clear();
         }
     };
-    const auto add_hit = [&](const WindowHit& hit, float bound) {
-        const HitKey key = hit.key();
+    const auto add_hit = [&](const TileHit& hit, uint32_t order, float bound) {
+        const HitKey key{hit.range, order};
         if (key < from || !(key < limit)) {
             is_limited = is_limited || !(key < from);
             return;
@@ -496,7 +419,7 @@ __global__ void __launch_bounds__(kRayTileSize)
         if (is_over) return;
         if (window.size() == kWindow) {
             is_limited = true;
-            const HitKey farthest = window.hit(kWindow - 1).key();
+            const HitKey farthest = window.key(kWindow - 1);
             if (!(key < farthest)) {
                 limit = key;
                 return;
@@ -504,18 +427,26 @@ __global__ void __launch_bounds__(kRayTileSize)
             limit = farthest;
             window.drop_farthest();
         }
-        window.insert(hit);
+        window.insert(hit, order);
     };
 
     for (bool is_done = false; !is_done;) {
-        batches.start();
-        for (uint32_t b = 0; batches.size(b) > 0; ++b) {
-            batches.wait();
+        for (uint32_t base = begin; base < end; base += kLoaded) {
             if (__syncthreads_and(is_over)) break;
-            batches.copy_behind(b);
+            const uint32_t count = min(kLoaded, end - base);
+            if (threadIdx.x <= kLoaded)
+                keys[threadIdx.x] =
+                    base + threadIdx.x < end ? entries[base + threadIdx.x] : ~uint64_t(0);
+            constexpr unsigned kVectors = sizeof(RayRecord) / sizeof(float4);
+            for (unsigned v = threadIdx.x; v < count * kVectors; v += kRayTileSize) {
+                const auto index = static_cast<uint32_t>(__ldg(entries + base + v / kVectors));
+                loaded[v / kVectors][v % kVectors] =
+                    reinterpret_cast<const float4*>(lists.records + index)[v % kVectors];
+            }
+            __syncthreads();
             bool reaches = false;
-            if (lane < batches.size(b)) {
-                const RayRange& range = batches.record(b, lane).range;
+            if (lane < count) {
+                const RayRange& range = reinterpret_cast<const RayRecord*>(loaded[lane])->range;
                 const int last = warp_column + kWarpColumns - 1;
                 const bool is_in_rows = warp_row <= range.row1 && warp_row + kWarpRows > range.row0;
                 const bool is_in_columns =
@@ -526,8 +457,8 @@ __global__ void __launch_bounds__(kRayTileSize)
             unsigned left = __ballot_sync(kAllLanes, reaches);
             if (__all_sync(kAllLanes, is_over)) left = 0;
             for (; left != 0; left &= left - 1) {
-                const unsigned e = __ffs(static_cast<int>(left)) - 1;
-                const RayRecord& record = batches.record(b, e);
+                const int e = __ffs(static_cast<int>(left)) - 1;
+                const RayRecord& record = *reinterpret_cast<const RayRecord*>(loaded[e]);
                 const RayHit<float> hit = hit_of(record.shape, x, y, z);
                 const float reach = record.shape.log2_opacity - float(kLog2MinAlpha);
                 const bool is_hit = !is_over && hit.falloff <= reach &&
@@ -535,15 +466,11 @@ __global__ void __launch_bounds__(kRayTileSize)
                 if (!is_hit) continue;
                 const float alpha = min_of(exp2_in_range(record.shape.log2_opacity - hit.falloff),
                                            float(kMaxAlpha));
-                const uint64_t key = batches.key(b, e);
-                const uint32_t light_of_record =
-                    RayLight<kReturns>::light_of(record, static_cast<uint32_t>(key));
-                add_hit({hit.range, alpha, record.order, light_of_record}, bound_of(key));
+                add_hit({hit.range, alpha, static_cast<uint32_t>(keys[e])}, record.order,
+                        bound_of(keys[e]));
             }
-            if (!is_over)
-                blend_before(batches.size(b + 1) > 0 ? bound_of(batches.key(b + 1, 0)) : INFINITY);
+            if (!is_over) blend_before(base + kLoaded < end ? bound_of(keys[kLoaded]) : INFINITY);
         }
-        batches.wait();
         if (!is_over) blend_before(INFINITY);
         is_over = is_over || !is_limited;
         from = limit;
