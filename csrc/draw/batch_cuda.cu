@@ -1,7 +1,7 @@
-// Batches of pictures of a scene on a CUDA device. A batch is one frame with a picture
-// for each camera. A large batch is several such frames, one after another. The first
-// kernel of a frame copies the cameras. A frame that is drawn again uses the copies,
-// because the caller may have changed the arrays.
+// Draws batches of pictures of a scene on a CUDA device. A batch is drawn as one frame
+// with a picture for each camera. A large batch is divided into several such frames.
+// The first kernel of a frame copies the cameras, because the caller may change its
+// arrays before a frame must be drawn again.
 
 #include <algorithm>
 #include <new>
@@ -15,9 +15,9 @@ namespace cuda {
 
 namespace {
 
-// Limits of a part, which bound its memory. Pictures of few pixels have a few gaussians
-// per pixel. If there are more gaussians and memory does not suffice, smaller parts are
-// drawn. Parts with more pixels are not faster, because a part already takes
+// Limits of a part of a batch, which bound its memory. The limit on gaussians assumes a
+// few gaussians per pixel. If there are more and memory does not suffice, smaller parts
+// are drawn. Parts with more pixels would not be faster, because a part already takes
 // milliseconds.
 constexpr size_t kMostPixels = size_t(1) << 23;
 constexpr size_t kMostPlaces = size_t(1) << 21;
@@ -34,7 +34,7 @@ const SeenBounds& seen_of(const SceneTables& scene, const CameraArrays& arrays) 
     return arrays.environments == nullptr ? scene.seen_by_all() : scene.seen_in_environment();
 }
 
-// Returns the largest number of cameras in a part, at least 1.
+// Returns the maximum number of cameras in a part, at least 1.
 uint32_t cameras_of_part(const BatchRequest& request, const SeenBounds& seen) {
     const size_t pixels = static_cast<size_t>(request.width) * request.height;
     const size_t most = std::min({kMostPixels / pixels, kMostPlaces / batch_slots(seen.instances),
@@ -56,7 +56,8 @@ std::shared_ptr<BatchTables> SceneFrame::tables_for(uint32_t num_cameras, cudaSt
     }
     if (found != tables_.end()) return *found;
     std::erase_if(tables_, [](const auto& tables) { return tables.use_count() == 1; });
-    // Allocates one more than necessary, because a later capture must not allocate.
+    // Allocate one more table than this batch needs, because a later capture must not
+    // allocate.
     for (int k = 0; k < 2; ++k)
         tables_.push_back(std::make_shared<BatchTables>(std::max(num_cameras, 1u), stream));
     return tables_.back();
@@ -157,7 +158,8 @@ void BatchDrawing::enqueue(uint32_t first, uint32_t count) {
             continue;
         } catch (const OutOfMemory&) {
             if (size == 1 || is_captured_) throw;
-        } catch (const std::length_error&) {  // the error of an earlier batch
+        } catch (const std::length_error&) {  // an earlier batch may have caused this
+                                              // error
             if (size == 1 || is_captured_) throw;
         }
         frame_.halve_parts(size);

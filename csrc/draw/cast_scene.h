@@ -1,7 +1,7 @@
 #pragma once
 
-// Casts the rays of a spherical sensor through a scene: the sensor, and the function of
-// the host. cast_scene_cuda.h has that of CUDA devices.
+// Casts the rays of a spherical sensor through a scene on the CPU. cast_scene_cuda.h
+// does the same on CUDA devices.
 
 #include <memory>
 
@@ -10,8 +10,8 @@
 
 namespace v3dg {
 
-// A sensor without a pose. Its pose has x forward, y left and z up in view space. The
-// camera that selects its cuts has one over the squared spacing of rays as
+// A sensor without a pose. Its axes in view space are x forward, y left and z up. The
+// camera that selects its cut must return one over the squared angle between rays from
 // px2_per_steradian().
 struct RaySensor {
     std::shared_ptr<const RayGrid> grid;
@@ -20,9 +20,9 @@ struct RaySensor {
 
 namespace cpu {
 
-// Selects the cut of a sensor, without a frustum, and casts all rays through it. The
-// camera has the pose of the sensor, and its density. `rule` has no budget. Returns the
-// number of selected gaussians.
+// Selects the cut of a sensor, without a frustum, and casts all rays through it.
+// `camera` has the sensor's pose and its density of rays. `rule` must not have a
+// budget. Returns the number of selected gaussians.
 int64_t cast_scene(const HostScene& scene, const RaySensor& sensor, const Camera& camera,
                    SelectRule rule, const RayPlanes& planes);
 

@@ -1,5 +1,5 @@
-// Implements cast_scene_cuda.h: the parts of a cast, its buffers, and casting a part
-// again if a buffer was too small.
+// Implements cast_scene_cuda.h: it divides a cast into parts, owns the buffers, and
+// casts a part again if a buffer was too small.
 
 #include "draw/cast_scene_cuda.h"
 
@@ -14,17 +14,18 @@ namespace cuda {
 
 namespace {
 
-// Limits of a part, which bound its memory: a record has 128 bytes. Keys of entries
-// have at least 16 bits for distances if a part has at most kMostTiles tiles.
+// Limits of a part, which bound its memory; a record has 128 bytes. With at most
+// kMostTiles tiles, keys of entries have at least 16 bits for distances.
 constexpr size_t kMostGaussians = size_t(1) << 23;
 constexpr size_t kMostTiles = size_t(1) << 15;
 constexpr uint32_t kMostPoses = 256;
-// The index of an entry has 32 bits.
+// Indices of entries have 32 bits.
 constexpr unsigned long long kMostEntries = (1ull << 32) - 2;
 
 constexpr unsigned kItemThreads = 128;
 
-// One thread per item of each pose: writes the items of an asset, and its placements.
+// Writes the items of an asset and its placements. Launched with one thread per item of
+// each pose.
 __global__ void asset_items_kernel(BatchViews views, uint32_t num_gaussians, uint32_t items_each,
                                    Appearance<float> appearance, Placement* placements,
                                    ItemList items) {
@@ -90,7 +91,7 @@ const RayDirections& DeviceRayGrid::load(const std::shared_ptr<const RayGrid>& g
     return directions_;
 }
 
-// A scene and its rule, or an asset.
+// What is cast: a scene and its rule, or an asset.
 struct RayFrame::Subject {
     const SceneTables* scene;
     SelectRule rule;
@@ -98,8 +99,8 @@ struct RayFrame::Subject {
     Appearance<float> appearance;
 };
 
-// The counters of a part on the device. Behind them are the zeros of items, then the
-// counts of the images.
+// The counters of a part on the device. The zeros of items follow them in memory, then
+// the counts of the images.
 struct RayFrame::Counts {
     FrameCounters items;
     RayListCounts lists;

@@ -11,9 +11,9 @@
 namespace v3dg {
 namespace cuda {
 
-// Poses on the device: (B, 4, 4) from the world to the sensor, and the environments
-// that it sees there. At a pose that is no rigid motion, or with an environment that
-// the scene does not have, the sensor sees nothing.
+// Poses on the device: (B, 4, 4) transforms from the world to the sensor, and the
+// environments that it sees there. If a pose is not a rigid motion, or the scene does
+// not have its environment, its rays hit nothing.
 struct RayPoses {
     const void* viewmats;
     bool are_double;
@@ -22,10 +22,10 @@ struct RayPoses {
     uint32_t count;
 };
 
-// The directions of a sensor, in device memory.
+// The directions of a sensor's rays, in device memory.
 class DeviceRayGrid {
   public:
-    // Copies the directions, unless they are there already.
+    // Copies the directions to the device if they are not there yet.
     const RayDirections& load(const std::shared_ptr<const RayGrid>& grid, cudaStream_t stream);
 
   private:
@@ -35,19 +35,19 @@ class DeviceRayGrid {
     RayDirections directions_{};
 };
 
-// Casts rays through scenes of the same bundles, or through assets. The buffers are
-// reused from cast to cast. Poses are cast in parts whose gaussians fit into bounded
-// memory. Each part waits once, for the numbers of its records and entries; the rest of
-// its work may be in progress on return.
+// Casts rays through scenes that share their bundles, or through assets. The buffers
+// are reused from cast to cast. Poses are cast in parts whose gaussians fit into
+// bounded memory. Each part waits for the device once, to read its numbers of records
+// and entries. The rest of its work may still be in progress when a cast returns.
 class RayFrame {
   public:
     // Sets the gaussians of each bundle of the scene.
     void set_models(std::vector<DeviceModel> models, cudaStream_t stream);
 
-    // Casts all rays through the cut of a scene at each pose; the cuts have no frustum.
-    // The planes follow each other. Returns the number of selected gaussians at each
-    // pose. `rule` has no budget. Throws OutOfMemory, or std::length_error if one pose
-    // has too many rays or entries.
+    // Casts all rays through the cut of a scene at each pose. The cuts have no frustum,
+    // and `rule` must not have a budget. The results of the poses follow one another in
+    // the planes. Returns the number of selected gaussians at each pose. Throws
+    // OutOfMemory, or std::length_error if one pose has too many rays or entries.
     std::vector<int64_t> cast_scene(const SceneTables& scene, const RaySensor& sensor,
                                     const RayPoses& poses, SelectRule rule, const RayPlanes& planes,
                                     cudaStream_t stream);
@@ -63,7 +63,7 @@ class RayFrame {
     struct Counts;
     std::vector<int64_t> cast(const Subject& subject, const RaySensor& sensor,
                               const RayPoses& poses, const RayPlanes& planes, cudaStream_t stream);
-    // Casts poses [first, first + count); returns the counts of gaussians.
+    // Casts poses [first, first + count), and returns their numbers of gaussians.
     std::vector<int64_t> cast_part(const Subject& subject, const RaySensor& sensor,
                                    const CameraArrays& poses, uint32_t first, uint32_t count,
                                    const RayPlanes& planes, cudaStream_t stream);
@@ -91,7 +91,7 @@ class RayFrame {
     DeviceBuffer<uint64_t> entries_;
     RaySortBuffers sorted_;
     size_t item_capacity_ = 1 << 12, record_capacity_ = 1 << 16, entry_capacity_ = 1 << 17;
-    uint32_t most_poses_ = 1;  // largest number of poses in the next part
+    uint32_t most_poses_ = 1;  // maximum number of poses in the next part
     StreamMutex busy_;
 };
 

@@ -1,6 +1,7 @@
 #pragma once
 
-// The clusters of a cut on the host, as neighbouring gaussians that are drawn alike.
+// Converts the clusters of a cut on the host to draws: runs of adjacent gaussians with
+// the same appearance.
 
 #include <algorithm>
 #include <stdexcept>
@@ -12,17 +13,17 @@
 
 namespace v3dg {
 
-// Returns the pairs of a selection. It refers to the selection.
+// Returns the pairs of a selection. The result points into the selection.
 inline GivenCut pairs_of(const SelectOutput& cut) {
     return {.instance = {cut.instance.data(), cut.instance.size()},
             .cluster = {cut.cluster.data(), cut.cluster.size()},
             .weight = {cut.weight.data(), cut.weight.size()}};
 }
 
-// Converts the clusters of a cut to draws. Clusters of one instance become a single
-// draw if their rows are adjacent and their appearance and weights are equal. `tint`
-// has SH coefficients of degree 0, [S][3] for S pairs, which replace the gaussians'
-// colours; null: none.
+// Converts the clusters of a cut to draws. Clusters of one instance are joined into a
+// single draw if their rows are adjacent, and their appearance and weights are equal.
+// `tint` is null, or has SH coefficients of degree 0 that replace the gaussians'
+// colours, [S][3] for S pairs.
 class CutDraws {
   public:
     CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given,
@@ -39,8 +40,8 @@ class CutDraws {
         return {instance_of_draw_.data(), instance_of_draw_.size()};
     }
     int64_t num_gaussians() const { return static_cast<int64_t>(num_gaussians_); }
-    // Returns the index of the pair that a gaussian belongs to. `gaussian` is counted
-    // over all draws.
+    // Returns the index of the pair that a gaussian belongs to. `gaussian` is its index
+    // in the concatenation of all draws.
     size_t pair_of(uint64_t gaussian) const {
         return std::upper_bound(end_of_pair_.begin(), end_of_pair_.end(), gaussian) -
                end_of_pair_.begin();
@@ -91,8 +92,8 @@ class CutDraws {
         instance_of_draw_.push_back(scene_.instance_ids.empty() ? i : scene_.instance_ids[i]);
     }
 
-    // Returns whether a and b, draws of one instance, can be joined: b begins where a
-    // ends, and both are drawn alike.
+    // Returns whether two draws of one instance can be joined: b must begin where a
+    // ends, and both must have the same appearance.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
         return a.first + a.count == b.first && a.appearance == b.appearance &&
                a.weight == b.weight && a.palette.sh == b.palette.sh;
@@ -103,7 +104,7 @@ class CutDraws {
     const bool fades_;
     std::vector<Draw<float>> draws_;
     std::vector<int32_t> instance_of_draw_;
-    // [S] end of each pair's gaussians, counted over all draws.
+    // [S] end of each pair's gaussians in the concatenation of all draws.
     std::vector<uint64_t> end_of_pair_;
     uint64_t num_gaussians_ = 0;
     int32_t last_instance_ = -1;

@@ -1,5 +1,5 @@
 // Implements device_pages.h. Before a cut, the bytes of arriving pages are copied to
-// the device; kernels then unpack them or move them to their slots. After the cut, the
+// the device, where kernels unpack them or move them to their slots. After the cut, the
 // page requests are copied to the host. A Flight holds the host memory of both
 // transfers.
 
@@ -17,14 +17,14 @@ namespace cuda {
 
 namespace {
 
-// A frame may copy as many bytes as are expected to take kBringMs, but at least
-// kLeastBytesAFrame. The speed is measured on frames that copy at least kLeastMeasured
-// bytes.
+// A frame copies at most as many bytes as can be copied in kBringMs, and may always
+// copy kLeastBytesAFrame. The speed of copying is measured on frames that copy at least
+// kLeastMeasured bytes.
 constexpr float kBringMs = 2.0f;
 constexpr size_t kLeastMeasured = size_t(4) << 20, kLeastBytesAFrame = size_t(8) << 20;
 
-// A page to copy from host memory to the device, and the entries of the page table that
-// change with it. One block of threads copies the page.
+// A page to copy from host memory to the device, and the entries of the page table to
+// set afterwards. One block of threads copies the page.
 struct PageMove {
     const uint4* from;
     uint4* to;
@@ -33,8 +33,8 @@ struct PageMove {
     uint32_t *cluster_shift, cluster_value;  // `cluster_shift` may be null
 };
 
-// One block per page. The kernel reads host memory directly, so that a single launch
-// copies all pages.
+// Launched with one block per page. The kernel reads host memory directly, so that a
+// single launch copies all pages.
 __global__ void move_kernel(const PageMove* moves) {
     const PageMove move = moves[blockIdx.x];
     for (size_t i = threadIdx.x; i < move.num_vectors; i += blockDim.x) move.to[i] = move.from[i];
@@ -43,7 +43,7 @@ __global__ void move_kernel(const PageMove* moves) {
     if (move.cluster_shift != nullptr) *move.cluster_shift = move.cluster_value;
 }
 
-// One thread per page whose fade starts or ends.
+// Launched with one thread per page whose fade starts or ends.
 __global__ void arrivals_kernel(const Arrival* arrivals, unsigned count, int32_t* begins) {
     const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < count) begins[arrivals[i].page] = arrivals[i].begins;
@@ -63,8 +63,8 @@ Pinned<T> pinned(size_t count) {
     return Pinned<T>(static_cast<T*>(memory));
 }
 
-// Returns the number of floats per row of SH coefficients. The coefficients of degree 0
-// are not in the row, but in the planes. Rows are aligned to 16 bytes.
+// Returns the number of floats per row of SH coefficients. A row does not include the
+// coefficients of degree 0, which are in the planes. Rows are aligned to 16 bytes.
 int stride_of(int sh_degree) {
     return sh_degree == 0 ? 0 : (3 * num_sh_bases(sh_degree) + 3) / 4 * 4;
 }
@@ -73,8 +73,8 @@ int stride_of(int sh_degree) {
 
 void FreePinned::operator()(void* memory) const noexcept {
     if (cudaFreeHost(memory) != cudaSuccess)
-        // Clear the error. At exit the driver may be unloaded before this object is
-        // destroyed.
+        // Ignore errors, because at exit the driver may be unloaded before this object
+        // is destroyed.
         cudaGetLastError();
 }
 
@@ -86,10 +86,11 @@ size_t packed_row_bytes(int max_sh_degree) {
     return sizeof(float) * (16 + static_cast<size_t>(stride_of(max_sh_degree)));
 }
 
-// The pinned host memory of a frame. It is in use until the frame's cut is finished.
+// The pinned host memory of a frame. It must not be reused until the frame's cut is
+// finished.
 struct DevicePages::Flight {
     const Pinned<PageMove> moves;
-    const Pinned<PageRows> rows;  // pages to unpack, if the pool keeps rows
+    const Pinned<PageRows> rows;  // pages to unpack, used if the pool keeps rows
     const Pinned<SlotPage> codes;
     const Pinned<Arrival> arrivals;
     const Pinned<NeedsReport> report;
@@ -114,7 +115,7 @@ struct DevicePages::Flight {
     ~Flight() {
         for (cudaEvent_t event : {done, begun, brought})
             if (event != nullptr && cudaEventDestroy(event) != cudaSuccess)
-                // Clear the error. At exit the driver may be unloaded before this
+                // Ignore errors, because at exit the driver may be unloaded before this
                 // object is destroyed.
                 cudaGetLastError();
     }
@@ -212,12 +213,12 @@ void DevicePages::make_tables(const std::vector<ClusterTable>& host,
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
-// Wait for all streams, because frames on any stream may still read the slots. A buffer
-// is freed only in the order of the stream that allocated it.
+// Wait for all streams, because frames on any of them may still read the slots. Freeing
+// a buffer only waits for the stream that allocated it.
 DevicePages::~DevicePages() { busy_.wait(); }
 
-// Passes the page requests of all finished cuts to the pool. Returns the pool's answer
-// to the last of them. If `waits`, it waits for all cuts.
+// Passes the page requests of all finished cuts to the pool, and returns the pool's
+// answer to the last of them. If `waits` is true, first waits for all cuts.
 NotedView DevicePages::note_flights(bool waits) {
     NotedView noted;
     while (!under_way_.empty()) {
@@ -236,8 +237,8 @@ NotedView DevicePages::note_flights(bool waits) {
         needs->count = std::min<size_t>(flight.report[0].count, pool_.most_needs());
         needs->num_left_out = flight.report[0].count - needs->count;
         needs->tolerance_px2 = flight.report[0].tolerance_px2;
-        // A caller that waits expects a result that does not depend on earlier frames,
-        // so the tolerance must not adapt.
+        // A caller that waits expects a result that does not depend on earlier frames.
+        // Therefore the tolerance must not adapt.
         needs->adapts = flight.is_bounded && !waits;
         noted = pool_.note_needs(needs, waits);
         under_way_.pop_front();
@@ -250,7 +251,7 @@ void DevicePages::note_frames(cudaStream_t stream) {
     note_flights(false);
 }
 
-// Adapts the number of bytes that a frame may copy to the speed measured in `flight`.
+// Adapts the number of bytes that a frame may copy to the speed of `flight`.
 void DevicePages::measure(const Flight& flight) {
     if (flight.bytes_in < kLeastMeasured) return;
     float ms = 0;
@@ -272,7 +273,7 @@ const int64_t* DevicePages::offset_on_device(const PageChange& change) const {
            pool_.source(change.bundle).first_cluster(change.page);
 }
 
-// Returns the rows of a page whose bytes are on the device.
+// Returns the rows of a page whose bytes have been copied to the device.
 PageRows DevicePages::page_rows(const PageChange& change, const unsigned char* bytes) const {
     const PageSource& source = pool_.source(change.bundle);
     PageRows page{rows_of_page(bytes, source.num_rows(change.page), source.sh_degree()),

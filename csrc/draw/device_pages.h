@@ -28,20 +28,20 @@ class PinnedBlocks : public BlockMemory {
     std::vector<Pinned<unsigned char>> blocks_;
 };
 
-// The largest number of frames whose cuts may be in progress on the device. The next
-// frame waits for the oldest cut.
+// Maximum number of frames whose cuts are in progress on the device. The next frame
+// waits for the oldest cut.
 constexpr size_t kMostFlights = 4;
 
 // Returns the bytes of a packed row in a pool.
 size_t packed_row_bytes(int max_sh_degree);
 
-// The gaussians in the slots of a pool, as codes or as packed rows. Pages of any codec
-// can be packed. Frames read the slots and page changes write them, on any stream of
-// the device, while mutex() is locked. The mutex makes the device process this work in
-// the order of locking.
+// The gaussians in the slots of a pool, either as codes or as packed rows. Pages of any
+// codec can be packed. While mutex() is locked, frames may read the slots and page
+// changes may write them, on any stream of the device. The device processes this work
+// in the order in which the mutex was locked.
 class DevicePages {
   public:
-    // `tables` are on the current device. `host` are the same tables in host memory.
+    // `tables` are on the current device, and `host` are copies in host memory.
     DevicePages(PagePool& pool, std::vector<std::shared_ptr<const BundleTables>> tables,
                 const std::vector<ClusterTable>& host,
                 const std::vector<ClusterAppearance>& appearance, cudaStream_t stream);
@@ -50,23 +50,25 @@ class DevicePages {
     DevicePages& operator=(const DevicePages&) = delete;
 
     StreamMutex& mutex() { return busy_; }
-    // Starts a frame. Passes the page requests of finished cuts to the pool, enqueues
+    // Starts a frame: passes the page requests of finished cuts to the pool, enqueues
     // the copies of arriving pages, and returns the tables for the frame's cut. Waits
-    // only if kMostFlights cuts are in progress. mutex() must be locked.
+    // only if kMostFlights cuts are in progress. The caller must have locked mutex().
     PartlyResident begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream);
-    // Ends a frame; to be called when its cut is enqueued. mutex() must be locked.
+    // Ends a frame. Call this after its cut is enqueued. The caller must have locked
+    // mutex().
     void end_frame(cudaStream_t stream);
     // Passes the page requests of finished cuts to the pool, without starting a frame.
     void note_frames(cudaStream_t stream);
-    // The models of all bundles, on the device. One of the two arrays is null.
+    // The models of all bundles, on the device. One of packed() and coded() is null.
     const PackedPlanes* packed() const { return packed_.data(); }
     const CodedGaussians* coded() const { return coded_.data(); }
-    // Returns the rule with the tolerance that the pool sets for the current frame.
+    // Returns the rule with the tolerance that the pool has chosen for the current
+    // frame.
     SelectRule raised(SelectRule rule) const;
 
     // Selects a cut without drawing, and waits until the pool has decided about the
-    // pages that the cut requests. If `begins`, the pool first discards the requests of
-    // earlier frames (PagePool::begin_settling).
+    // pages that the cut requests. If `begins` is true, the pool first discards the
+    // requests of earlier frames (PagePool::begin_settling).
     SettlingStep settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                              bool begins, cudaStream_t stream);
 
@@ -98,12 +100,12 @@ class DevicePages {
     DeviceBuffer<CodedGaussians> coded_;
     DeviceBuffer<unsigned char> staged_;
     DeviceBuffer<uint8_t> joins_;
-    DeviceBuffer<int64_t> shift_;  // one element per page, over all bundles
-    // One element per page, over all bundles, if the pool keeps codes.
+    DeviceBuffer<int64_t> shift_;  // One element per page, over all bundles.
+    // One element per page, over all bundles. Only used if the pool keeps codes.
     DeviceBuffer<uint32_t> cluster_shift_;
-    // One element per page, over all bundles; see PageTable.
+    // One element per page, over all bundles, as described at PageTable.
     DeviceBuffer<int32_t> begins_;
-    // Index of each bundle's first page among the pages of all bundles.
+    // For each bundle, the index of its first page among the pages of all bundles.
     std::vector<size_t> first_page_;
     DeviceBuffer<BundleOnDevice> bundles_;
     DeviceBuffer<uint32_t> words_;
@@ -112,7 +114,7 @@ class DevicePages {
     size_t num_words_ = 0;
     std::vector<std::unique_ptr<Flight>> flights_;
     std::deque<Flight*> under_way_;
-    Flight* current_ = nullptr;  // the frame between begin_frame() and end_frame()
+    Flight* current_ = nullptr;  // the frame that was begun but not ended
     Cut cut_;
 };
 

@@ -7,8 +7,8 @@ namespace v3dg {
 
 namespace {
 
-// The colours of levels, the finest first. Adjacent levels differ in hue and in
-// lightness.
+// The colours of levels, beginning with the finest. Adjacent levels differ in hue and
+// in lightness.
 constexpr Rgb kLevels[] = {{0.90f, 0.24f, 0.22f}, {0.98f, 0.60f, 0.17f}, {0.99f, 0.88f, 0.30f},
                            {0.50f, 0.78f, 0.32f}, {0.20f, 0.65f, 0.55f}, {0.26f, 0.65f, 0.90f},
                            {0.27f, 0.40f, 0.80f}, {0.55f, 0.35f, 0.75f}, {0.85f, 0.45f, 0.70f}};
@@ -17,7 +17,7 @@ constexpr Rgb kRamp[kRampColors] = {
     {0.05f, 0.03f, 0.15f}, {0.27f, 0.06f, 0.39f}, {0.53f, 0.13f, 0.42f}, {0.77f, 0.23f, 0.33f},
     {0.94f, 0.42f, 0.20f}, {0.99f, 0.66f, 0.22f}, {0.99f, 0.95f, 0.65f}};
 constexpr Rgb kThere{0.13f, 0.45f, 0.5f}, kNear{1.0f, 0.85f, 0.3f}, kFar{0.75f, 0.1f, 0.1f};
-constexpr float kMostOctaves = 6;  // All ratios above 2^6 have the same colour.
+constexpr float kMostOctaves = 6;  // ratios above 2^6 all have the same colour
 
 Rgb between(const Rgb& from, const Rgb& to, float share) {
     Rgb color{};

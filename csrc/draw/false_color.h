@@ -24,9 +24,9 @@ Rgb cluster_color(size_t cluster);
 constexpr size_t kRampColors = 7;
 Rgb ramp_color(float value);
 
-// Returns the colour of a cluster whose metric is `share` times the tolerance. Up to
-// `most` the cluster is fine enough. Above that it is too coarse, because pages with
-// finer clusters are missing, and the colour shows the ratio.
+// Returns the colour of a cluster whose metric is `share` times the tolerance. Up to a
+// share of `most`, the cluster is fine enough. Above it, pages with finer clusters are
+// missing, and the colour shows the ratio.
 Rgb missing_color(float share, float most);
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// Implements frame_cuda.h: the buffers of a frame, the order of its stages, and drawing
+// Implements frame_cuda.h: owns the buffers of a frame, runs its stages, and draws
 // again if a buffer was too small.
 
 #include "draw/frame_cuda.h"
@@ -14,16 +14,15 @@
 namespace v3dg {
 namespace cuda {
 
-// Device memory of a frame that is cleared before the frame: counters of results and
-// work.
+// Device memory that is cleared before each frame: counters of results and of work.
 struct Frame::State {
     FrameCounters counters;
     unsigned projected[2], scan_ticket, scattered,
-        spread;  // work counters that kernels claim items of work from
+        spread;  // counters from which kernels claim work
     alignas(8) uint32_t plan_counts[2 * kPlanClasses];
 };
 
-// Host memory and events of a frame in flight.
+// Host memory and events of one frame in flight.
 struct Frame::Slot {
     FrameCounters* counters = nullptr;  // in pinned host memory
     cudaEvent_t begun = nullptr, prepared = nullptr, counted = nullptr, done = nullptr;
@@ -37,8 +36,8 @@ struct Frame::Slot {
     }
     ~Slot() {
         const KeepsCaptures keeps_captures;
-        // Ignore errors. At exit the driver may be unloaded before this object is
-        // destroyed.
+        // Ignore errors, because at exit the driver may be unloaded before this object
+        // is destroyed.
         for (const cudaEvent_t event : {begun, prepared, counted, done})
             if (event != nullptr) cudaEventDestroy(event);
         cudaFreeHost(counters);
@@ -47,12 +46,12 @@ struct Frame::Slot {
 };
 
 constexpr size_t kEllipseFloats = 8,
-                 // Floats per record in RecordPlanes::ellipse; in `ellipse` and `rest`
-                 // together.
+                 // Floats per record: in RecordPlanes::ellipse, and in `ellipse` and
+                 // `rest` together.
     kRecordFloats = 10;
 
-// The number of slots that are allocated in advance. More slots are allocated when more
-// frames are in flight or captured.
+// Number of slots that are allocated in advance. More are allocated if more frames are
+// in flight or captured.
 constexpr size_t kSlots = 8;
 
 Frame::Frame(Keeps keeps)
@@ -91,7 +90,8 @@ T* Frame::room(GrowingBuffer<T>& buffer, size_t size, const Drawing& drawing) {
 }
 
 Frame::Slot* Frame::take_slot(bool capturing) {
-    // The oldest frame ends first. During a capture, events must not be queried.
+    // Frames end in order, so look at the oldest one. During a capture, events must not
+    // be queried.
     const bool waits = !free_slots_.empty() && !capturing &&
                        cudaEventQuery(free_slots_.front()->done) != cudaSuccess;
     if (free_slots_.empty() || waits) {
@@ -113,10 +113,11 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Growing a buffer that moves takes as long as drawing several frames, and a frame
-    // that exceeds a buffer is drawn twice. So buffers grow before a moving camera
-    // exceeds them. All buffers that are nearly full grow together, by more than the
-    // counts require; by less if they grow in place.
+    // Growing a buffer by moving it takes as long as drawing several frames, and a
+    // frame that exceeds a buffer is drawn twice. Therefore buffers are enlarged before
+    // a moving camera exceeds them. All buffers that are nearly full grow at once, and
+    // by more than the counts require. Buffers that grow in place are cheap to enlarge,
+    // so they grow by less.
     const auto is_full = [](unsigned long long capacity, unsigned long long count,
                             unsigned free_part) { return count > capacity - capacity / free_part; };
     const bool grows = is_full(capacity_.items, counters.items, 32) ||
@@ -130,8 +131,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     const auto grow = [is_full, part](unsigned long long& capacity, unsigned long long count) {
         if (is_full(capacity, count, part)) capacity = std::max(capacity, count + count / part);
     };
-    // If the gaussians exceed their capacity, no entries were counted, so estimate
-    // their number: most scenes have one or two entries per gaussian.
+    // If the gaussians exceed their capacity, their entries were not counted. Estimate
+    // one entry per gaussian, because most scenes have one or two.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
     grow(capacity_.items, counters.items);
     grow(capacity_.records, counters.gaussians);
@@ -141,12 +142,13 @@ void Frame::enlarge(const FrameCounters& counters) {
     capacity_.records = std::min(capacity_.records, kMostFrameRecords);
     // The records' tile lists and the spread lists use the same memory.
     capacity_.spread = std::max(capacity_.spread, capacity_.records);
-    // With a tape, the caller receives the counts before lists are spread. So the
-    // buffer must have room for all entries.
+    // With a tape, the caller receives the counts before the lists are spread.
+    // Therefore the buffer must have room for all entries.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
     if (was_captured_ || grows_in_place_ || capacity_ == before) return;
-    // Free the largest buffers before allocating larger ones, and return their memory
-    // to the device, because the memory pool cannot reuse the smaller blocks.
+    // Free the largest buffers before larger ones are allocated. Their memory is
+    // returned to the device, because the memory pool cannot reuse blocks that are too
+    // small.
     release_large_buffers();
     trim_pool(last_stream_);
 }
@@ -233,8 +235,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
-    // Later, the blend stage stores spread lists in this memory. By then, the tile
-    // lists of small records are no longer needed.
+    // The blend stage later stores spread lists in this memory. By then, the tile lists
+    // of small records are no longer needed.
     FewTiles* few = room(scratch_, capacity.spread, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
     const FrameSensors& sensors = batch.sensors;
@@ -291,9 +293,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     const RasterTape tape{needs_order ? room(order_, capacity.entries, drawing) : nullptr,
                           needs_order ? room(blended_, batch.num_tiles, drawing) : nullptr};
     FrameLists of_frame = lists(batch);
-    // With a tape, the counts are copied before blending, so that the caller need not
-    // wait for the pictures. Without a tape, the blend kernel writes them to host
-    // memory.
+    // With a tape, copy the counts before blending, so that the caller need not wait
+    // for the pictures. Without a tape, the blend kernel writes them to host memory.
     if (keeps_tape) {
         place_slots(items, item_records, planes.box, room(first_slot_, capacity.records, drawing),
                     stream);
@@ -316,9 +317,9 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
-    // Clear the counters for the next frame now, so that it starts sooner. There are
-    // two exceptions: a captured graph may be replayed at any time, and the backward
-    // pass of a tape reads the counters.
+    // Clear the counters now, so that the next frame starts sooner. There are two
+    // exceptions: a captured graph may be replayed at any time, and the backward pass
+    // of a tape reads the counters.
     if (was_captured_ || keeps_tape) return;
     check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
     num_zero_bytes_ = num_zero_bytes;
@@ -407,7 +408,7 @@ Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, 
     : frame_(frame), batch_(batch), prepare_(std::move(prepare)), stream_(stream) {}
 
 Drawing::~Drawing() {
-    // A captured graph continues to write to its slot.
+    // A captured graph still writes to its slot, so the slot is not reused.
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }
 
@@ -452,7 +453,8 @@ bool Drawing::finish_or_enlarge() {
 }
 
 void Drawing::enlarge_frame() {
-    // The next frame must not throw again for the counts of this one.
+    // This frame reports its error itself, so the next frame must not throw for the
+    // same counts.
     std::erase(frame_.unchecked_, slot_);
     frame_.enlarge(*slot_->counters);
 }

@@ -19,7 +19,7 @@
 namespace v3dg {
 namespace cuda {
 
-// The input of a frame. The device memory must stay unchanged until the frame is drawn.
+// The input of a frame. Its device memory must not change until the frame is drawn.
 struct FrameBatch {
     const GaussianRows<const float>* models;
     const Placement* placements;
@@ -28,9 +28,10 @@ struct FrameBatch {
     // Packed and coded models (see ProjectInput).
     const PackedPlanes* packed = nullptr;
     const CodedGaussians* coded = nullptr;
-    // Whether any item may be shared; must be false with a tape.
+    // Whether any item may be shared by several placements. Must be false with a tape.
     bool has_shared_items = false;
-    // The same for all images; kStopsByCut only with a budget.
+    // The transmittance at which pixels of all images stop. kStopsByCut is only allowed
+    // with a budget.
     float min_transmittance = kStopsBefore;
     // Whether any item may have a weight below 1. Such items occur only in scenes, and
     // are never shared.
@@ -39,24 +40,23 @@ struct FrameBatch {
     // [num_factors] as in ProjectInput; may be null
     const InstanceFactors* factors = nullptr;
     uint32_t num_factors = 0;
-    // The mutex that guards the models, if they change between frames; else null. The
-    // caller must hold it during draw().
+    // The mutex that guards the models, or null if they never change between frames.
+    // The caller must hold it during draw().
     StreamMutex* guards_models = nullptr;
     size_t num_zeros = 0;  // size of ItemList::zeros
-    // Whether depth is drawn in any of the images that get their destination from a
-    // Place.
+    // Whether depth is drawn in the images whose destination is set by a Place.
     bool has_depth = true;
     ImageCounts* image_counts = nullptr;  // as in ProjectInput
-    // Whether images become NaN if they are not drawn because a buffer is too small.
-    // All of them have planes.
+    // Whether images are filled with NaN if they are not drawn because a buffer is too
+    // small. If so, all images must have planes.
     bool marks_undrawn = false;
-    // Channels and meshes of the images; and the scene that the channels show.
+    // Channels and meshes of the images, and the scene that the channels show.
     FrameSensors sensors = {};
     SensedScene sensed_scene = {};
 };
 
-// The results of a frame that its backward pass needs. Valid until the next frame is
-// drawn.
+// The results of a frame that its backward pass needs. They are valid until the next
+// frame is drawn.
 struct FrameTape {
     FrameLists lists;
     RasterTape raster;
@@ -64,8 +64,8 @@ struct FrameTape {
     const Placement* placements;
     const DrawItem* items;         // counters->items elements
     const uint32_t* item_records;  // number of records of each item
-    const uint32_t* source;        // index of each record's gaussian in the model
-    // First gradient slot of each record, set by place_slots().
+    const uint32_t* source;        // index of each record's gaussian in its model
+    // First gradient slot of each record, written by place_slots().
     const uint32_t* first_slot;
 };
 
@@ -79,9 +79,9 @@ class Drawing;
 // reused from frame to frame.
 //
 // Counts stay on the device, so draw() does not wait. If a buffer turns out to be too
-// small, nothing is drawn; Drawing::finish() then enlarges the buffers and draws again.
-// Therefore pictures must be read only after finish(). Frames may be enqueued on any
-// streams, one at a time.
+// small, nothing is drawn. Drawing::finish() then enlarges the buffers and draws again,
+// so pictures must not be read before finish(). Frames may use different streams, but
+// only one thread may call draw() at a time.
 class Frame {
   public:
     enum class Keeps { nothing, tape };
@@ -91,25 +91,25 @@ class Frame {
     Frame(const Frame&) = delete;
     Frame& operator=(const Frame&) = delete;
 
-    // A function that enqueues the work to write the batch's items and the tables that
-    // do not exist yet. If the frame is drawn again, the function is called again. All
-    // counters are zero before that work runs.
+    // A function that enqueues the work that writes the batch's items and any tables
+    // that are still missing. It is called again each time the frame is drawn again.
+    // All counters are zero before that work runs.
     using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
 
     // A function that sets the destinations of images that have none. It is called
-    // once, after the first work for the device is enqueued.
+    // once, after the first work is enqueued.
     using Place = std::function<void(PicturePlanes planes[2])>;
 
     // Enqueues a frame. While `stream` captures a graph, nothing can be allocated, so a
     // frame of the same size must be drawn before the capture. The buffers of a
-    // captured frame exist as long as this object.
+    // captured frame are kept until this object is destroyed.
     std::unique_ptr<Drawing> draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
                                   const Place& place = {});
 
-    // Returns the device memory in bytes, by part.
+    // Returns the device memory in bytes, one entry per purpose.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
-    // Frees the buffers, so that a smaller frame fits. Does nothing if a graph was
+    // Frees the buffers, to make room for a smaller frame. Does nothing if a graph was
     // captured, because the graph may still use the buffers.
     void release_buffers();
 
@@ -130,9 +130,9 @@ class Frame {
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
-    // Enlarges the buffers if an earlier, finished frame exceeded or nearly filled one.
-    // The next frame is then likely to exceed it, too. The drawing of the earlier frame
-    // may have been destroyed.
+    // Enlarges the buffers if an earlier, finished frame exceeded or nearly filled one,
+    // because the next frame would probably exceed it. The Drawing of that frame may be
+    // destroyed already.
     void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
@@ -142,84 +142,85 @@ class Frame {
     T* room(GrowingBuffer<T>& buffer, size_t size, const Drawing& drawing);
     // Frees the large buffers.
     void release_large_buffers();
-    // Waits for the device if it may use memory that is unmapped when it is freed.
+    // Waits for the device if freeing the buffers unmaps memory that it may still use.
     void wait_before_unmapping() const;
 
     const Keeps keeps_;
     // Whether the large buffers grow in place. With a tape they do not, because other
-    // streams may read a tape when its frame is destroyed.
+    // streams may still read the tape when its frame is destroyed.
     const bool grows_in_place_;
     static constexpr Capacity kFirstCapacity{64, 4096, 4096, 4096, 4096};
     Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
-    // Normals and instances of records, for channels.
+    // Normals and instances of records, for the sensor pass.
     DeviceBuffer<float> normals_;
     DeviceBuffer<int32_t> instances_;
     DeviceBuffer<ItemTiles> item_tiles_;
-    // The large buffers.
+    // Large buffers, which are enlarged together.
     GrowingBuffer<float> records_;
-    DeviceBuffer<RecordBox> boxes_;  // of a tape
+    DeviceBuffer<RecordBox> boxes_;  // only used with a tape
     GrowingBuffer<LargeRecord> large_;
     GrowingBuffer<TileEntry> entries_;
     GrowingBuffer<unsigned long long> scratch_;  // tile lists of small records, later spread lists
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;
-    // State, scan state, zeros for items, tile counts
+    // Memory that is cleared: state, scan state, zeros for items, tile counts.
     DeviceBuffer<unsigned char> cleared_;
-    // The first bytes of `cleared_` that are zero when the next frame starts.
+    // Number of bytes at the beginning of `cleared_` that are zero when the next frame
+    // starts.
     size_t num_zero_bytes_ = 0;
 
     std::vector<std::unique_ptr<Slot>> slots_;
-    // The device may still be drawing frames of free slots.
+    // Slots that can be reused. The device may still be drawing their frames.
     std::deque<Slot*> free_slots_;
     // Buffers that captured graphs may still use.
     std::vector<std::shared_ptr<void>> retired_;
     bool was_captured_ = false;
-    // Slots of frames whose counts were not compared with the buffers.
+    // Slots of frames whose counts have not been compared with the buffers yet.
     std::vector<Slot*> unchecked_;
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
     StreamMutex busy_;
 };
 
-// A frame that was enqueued. The Frame must outlive it.
+// A frame that was enqueued. It must be destroyed before its Frame.
 class Drawing {
   public:
     ~Drawing();
     Drawing(const Drawing&) = delete;
     Drawing& operator=(const Drawing&) = delete;
 
-    // Waits until the device has finished. If a buffer was too small, nothing was drawn
-    // yet, and finish() draws again.
+    // Waits until the device has finished. The picture may still be missing: if a
+    // buffer was too small, finish() draws again.
     void wait() const;
-    // Like finish(), but returns as soon as it is certain that the buffers suffice.
-    // With a tape, the pictures may then still be in progress. Not allowed for a
+    // Like finish(), but returns as soon as the buffers are known to suffice. With a
+    // tape, the pictures may then still be in progress. Must not be called for a
     // captured frame.
     const FrameCounters& settle();
-    // Waits until the pictures are drawn. Draws again if a buffer was too small. Throws
-    // OutOfMemory, or std::length_error if there are more than kMostFrameRecords
+    // Waits until the pictures are drawn. If a buffer was too small, draws again.
+    // Throws OutOfMemory, or std::length_error if there are more than kMostFrameRecords
     // records.
     //
-    // For a captured frame, it returns the counters of the last replay, which must have
-    // ended. It throws std::runtime_error if a buffer was too small for that replay.
+    // For a captured frame, returns the counters of the last replay, which must have
+    // ended. Throws std::runtime_error if a buffer was too small for that replay.
     const FrameCounters& finish();
-    // Waits for the drawing, and returns whether it was drawn. If a buffer was too
-    // small, enlarges the buffer, so that the caller can draw a new frame instead.
-    // Throws like finish(). Not allowed for a captured frame.
+    // Waits for the device, and returns whether the frame was drawn. If not, enlarges
+    // the buffer that was too small, so that the caller can draw a new frame. Throws
+    // like finish(). Must not be called for a captured frame.
     bool finish_or_enlarge();
     bool is_captured() const { return is_captured_; }
     FrameTimes times() const;
-    // Returns how often the frame was drawn; more than once if a buffer was too small.
-    // Valid after finish().
+    // Returns how often the frame was drawn. It is drawn more than once if a buffer was
+    // too small. Valid after finish().
     int num_draws() const { return num_draws_; }
 
   private:
     friend class Frame;
     Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, cudaStream_t stream);
     bool was_drawn() const;
-    // Enlarges the buffers of the frame that were too small.
+    // Enlarges the buffers that were too small for this frame.
     void enlarge_frame();
 
     Frame& frame_;

@@ -6,7 +6,8 @@
 
 namespace v3dg {
 
-// The gaussians of a model, in planes (one array per component) that the model owns.
+// The gaussians of a model. Each component is stored in an array (a plane), which the
+// model owns.
 template <class T>
 class Model {
   public:

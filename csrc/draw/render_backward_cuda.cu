@@ -1,4 +1,4 @@
-// Pictures of one model with their backward pass, and idle frames for the next ones.
+// Draws pictures of one model, with a backward pass. Idle frames are kept for reuse.
 
 #include "draw/render_backward_cuda.h"
 
@@ -22,7 +22,7 @@ DifferentiableFrame::DifferentiableFrame() : frame_(Frame::Keeps::tape) {
 DifferentiableFrame::~DifferentiableFrame() {
     for (const cudaEvent_t event : {drawn_, gone_back_})
         if (event != nullptr) cudaEventDestroy(event);
-    // Ignore errors. At exit the driver may be unloaded before this object is
+    // Ignore errors, because at exit the driver may be unloaded before this object is
     // destroyed.
     cudaGetLastError();
 }
@@ -76,8 +76,8 @@ struct IdleFrames {
 };
 
 IdleFrames& idle_frames() {
-    // The object is never destroyed: at exit, the driver may be unloaded before static
-    // objects are destroyed.
+    // This object is never destroyed, because at exit the driver may be unloaded before
+    // static objects are destroyed.
     static IdleFrames& frames = *new IdleFrames;
     return frames;
 }

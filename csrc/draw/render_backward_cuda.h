@@ -8,7 +8,7 @@
 namespace v3dg {
 namespace cuda {
 
-// One model in one picture.
+// A picture of one model.
 struct ModelPicture {
     GaussianRows<const float> rows;
     ModelView<float> view;
@@ -26,14 +26,14 @@ class DifferentiableFrame {
     DifferentiableFrame(const DifferentiableFrame&) = delete;
     DifferentiableFrame& operator=(const DifferentiableFrame&) = delete;
 
-    // Enqueues a picture. Returns when it is certain that the buffers suffice. Throws
+    // Enqueues a picture. Returns as soon as the buffers are known to suffice. Throws
     // like Drawing::finish().
     void draw(const ModelPicture& in, cudaStream_t stream);
 
-    // Enqueues the backward pass of the last picture: the gradients of the gaussians,
-    // of their centres, and of the background (3). The picture and the gaussians must
-    // be unchanged since draw(). Writes every element. The result has the same bits in
-    // every run.
+    // Enqueues the backward pass of the last picture. It computes the gradients of the
+    // gaussians, of their centres, and of the background (3), and writes every element.
+    // The picture and the gaussians must not have changed since draw(). Every run gives
+    // the same bits.
     void backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
                   const CenterGradients<float>& centers, float* d_background, cudaStream_t stream);
 
@@ -47,8 +47,8 @@ class DifferentiableFrame {
     cudaEvent_t drawn_ = nullptr, gone_back_ = nullptr;
 };
 
-// Returns a frame for the current device. It reuses a frame of give_back() if there is
-// one. A frame must not be given back after an error.
+// Returns a frame for the current device. If possible, it is a frame that was returned
+// with give_back(). Do not give back a frame after an error.
 std::unique_ptr<DifferentiableFrame> take_frame();
 void give_back(std::unique_ptr<DifferentiableFrame> frame);
 

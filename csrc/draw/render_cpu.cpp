@@ -1,4 +1,4 @@
-// Draws pictures on the CPU, and computes gradients: the gaussians are projected and
+// Draws pictures and computes gradients on the CPU. The gaussians are projected and
 // binned in parallel pieces, and tiles are blended in parallel.
 
 #include "draw/render.h"
@@ -21,19 +21,19 @@
 
 namespace v3dg {
 
-// The number of gaussians of a draw that are projected together. Gaussians that are
-// adjacent in memory are usually adjacent in space. So a piece of this size covers few
-// rows of tiles.
+// Number of gaussians of a draw that are projected together. Gaussians that are
+// adjacent in memory are usually adjacent in space, so a piece of this size covers only
+// a few rows of tiles.
 constexpr uint64_t kPieceSize = 4096;
 
 struct Piece {
     size_t draw;
     uint64_t skip, count;  // range in the draw
-    uint64_t first;        // index of the first gaussian, counted over all draws
+    uint64_t first;        // index of the first gaussian in the concatenation of all draws
     Reach reach;           // set when the first band is drawn
 };
 
-// Pieces [first, last). One thread computes their records.
+// A range of pieces whose records are computed by one thread.
 struct Chunk {
     size_t first, last;
 };
@@ -51,8 +51,9 @@ static std::vector<Piece> pieces_of(const std::vector<Draw<T>>& draws) {
     return pieces;
 }
 
-// Divides the pieces into chunks: enough for all threads, but few enough that a chunk's
-// counters (one per tile) are small compared to its records.
+// Divides the pieces into chunks. There are enough chunks for all threads. They are
+// also large enough that the counters of a chunk (one per tile) are small compared to
+// its records.
 static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num_tiles) {
     const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
     const uint64_t size = std::min(
@@ -67,8 +68,8 @@ static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num
     return chunks;
 }
 
-// Allocates the memory of records. Each thread takes large strips and writes its chunks
-// there contiguously. So the used memory has few gaps, and unused memory is never
+// Allocates memory for records. Each thread takes large strips and writes its chunks
+// into them contiguously. Therefore there are few gaps, and unused memory is never
 // touched.
 class RecordRoom {
   public:
@@ -80,8 +81,8 @@ class RecordRoom {
             longest_ = std::max(longest_, end - pieces[c.first].first);
             total = end;
         }
-        // A thread takes a new strip when its current strip has no room for the longest
-        // chunk. So the gaps are at most an eighth of the strips.
+        // A thread takes a new strip when the longest chunk might not fit into its
+        // current strip. So gaps make up at most an eighth of the strips.
         strip_ = 8 * longest_;
         size_ = total + total / 7 + (mine_.size() + 1) * strip_;
         if (size_ > UINT32_MAX)
@@ -113,7 +114,8 @@ class RecordRoom {
     std::vector<Strip> mine_;
 };
 
-// Returns the gaussians that are projected after piece p, up to piece `last`.
+// Returns the run of gaussians that is projected after piece p. It is empty if the next
+// piece is not before `last`.
 template <class T>
 static NextRun<T> run_after(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
                             size_t p, size_t last) {
@@ -123,14 +125,14 @@ static NextRun<T> run_after(const std::vector<Draw<T>>& draws, const std::vector
             .first = draw.first + pieces[p + 1].skip};
 }
 
-// Returns whether loops of this thread are not divided among threads.
+// Returns whether loops on this thread run on a single thread.
 static bool runs_alone() { return most_threads() == 1 || omp_in_parallel() != 0; }
 
 static uint64_t num_gaussians_of(const std::vector<Piece>& pieces) {
     return pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
 }
 
-// Returns the tiles in falling order of the length of their lists, so that no thread
+// Returns the tiles in descending order of the length of their lists. So no thread
 // starts a long list at the end.
 static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_tiles) {
     std::vector<uint32_t> order(num_tiles);
@@ -141,22 +143,23 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
     return order;
 }
 
-// The approximate bytes of the records and entries of one band. Records are accessed
+// The approximate number of bytes of a band's records and entries. Records are accessed
 // randomly, so smaller bands use caches better; but a band must have tiles for all
-// threads. Bands have the smallest size in two cases: if there is a `stop` flag,
-// because the flag is rarely checked within a band, and if each thread draws a picture.
+// threads. The smallest size is used in two cases: with a `stop` flag, because the flag
+// is checked rarely within a band, and if each thread draws a picture of its own.
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
     if (stop != nullptr || is_in_parallel()) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
-// Pictures with at most this many gaussians are drawn in a single band, because they
-// need little memory.
+// Pictures with at most this many gaussians need little memory, so they are drawn in a
+// single band.
 constexpr uint64_t kFewGaussians = 65536;
 
-// Divides a window into bands of tile rows with about equally many bytes of records and
-// entries. The rows and bytes of a piece are estimated from its first few gaussians.
+// Divides a window into bands of tile rows with about the same number of bytes of
+// records and entries. The rows and bytes of a piece are estimated from its first few
+// gaussians.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
                                     const std::vector<Piece>& pieces, const Intrinsics<T>& camera,
@@ -202,7 +205,7 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
     return bands;
 }
 
-// Draws one band. If `is_first` (the first band of a picture), it also sets the reach
+// Draws one band. In the first band of a picture (`is_first`), it also sets the reach
 // of each piece.
 template <class T>
 static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
@@ -267,8 +270,8 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     counts.rasterize_seconds += now() - binned;
 }
 
-// Draws a picture of at most kMostChunkRecords gaussians on one thread, so that records
-// are in one sequence, and entries go straight to the lists of their tiles.
+// Draws a picture of at most kMostChunkRecords gaussians on one thread. All records are
+// then in one sequence, and entries are written directly to the lists of their tiles.
 template <class T>
 static void render_alone(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
                          const Intrinsics<T>& camera, const Picture<T>& picture, Workspace<T>& ws,
@@ -301,7 +304,7 @@ static void render_alone(const std::vector<Draw<T>>& draws, std::vector<Piece>& 
     counts.rasterize_seconds += now() - projected;
 }
 
-// Returns the part of a picture that is in a band.
+// Returns the part of a picture inside a band.
 template <class T>
 static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
     const size_t skip = static_cast<size_t>(band.y0 - picture.window.y0) *
@@ -315,7 +318,7 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
     return part;
 }
 
-// Runs the sensor pass over a band that was drawn.
+// Runs the sensor pass over a band after it was drawn.
 static void sense(const std::vector<Draw<float>>& draws, const Picture<float>& picture,
                   const Window& band, const DrawnSensor& sensor, Workspace<float>& ws,
                   const std::atomic<bool>* stop) {
@@ -367,8 +370,9 @@ void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Pic
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
     const uint64_t* entry = ws.lists.entry.data();
-    // A record has one gradient slot per tile. Adding the slots in the order of tiles
-    // makes the sum independent of the order of threads.
+    // A record has one gradient slot for each of its tiles. The slots are added in the
+    // order of the tiles, so that the sum does not depend on the order in which threads
+    // run.
     std::vector<uint64_t> first_slot(ws.room);
     uint64_t num_slots = 0;
     for (size_t c = 0; c < ws.num_chunks; ++c)

@@ -1,7 +1,7 @@
 #pragma once
 
-// The request for a frame, for all backends. Python creates this value, the bindings
-// pass it to a backend, and nothing changes it on the way.
+// The request for a frame, for all backends. It is created in Python, and the bindings
+// pass it to a backend without changes.
 
 #include <array>
 #include <optional>
@@ -17,13 +17,14 @@ namespace v3dg {
 // What the colours of a picture show.
 enum class FrameLook {
     appearance,  // the colours of the gaussians, or of a palette of clusters
-    missing,     // where finer pages are missing; see missing_color()
+    missing,     // which pages are missing; see missing_color()
     metrics,     // each cluster's metric divided by the tolerance, in grey
-    count        // like `appearance`, but the number of gaussians per pixel replaces depth
+    count        // like `appearance`, but the depth plane receives the number of
+                 // gaussians per pixel
 };
 
 // Options of blending: the background, the transmittance at which a pixel stops
-// (frame/image.h), and whether depth is drawn.
+// (frame/image.h), and whether to draw depth.
 struct Shade {
     std::array<double, 3> background;
     float min_transmittance = kStopsBefore;
@@ -32,39 +33,40 @@ struct Shade {
 
 struct FrameRequest {
     Eyes eyes;  // the camera of each picture
-    // The rule of the cut. With a given `cut`, only its tolerance matters.
+    // The rule of the cut. If `cut` is given, only the tolerance is used.
     SelectRule rule;
     Shade shade;
     FrameLook look = FrameLook::appearance;
     std::optional<GivenCut> cut = {};  // a cut to draw instead of selecting one
-    // Eyes for which the cut is selected; default: `eyes`.
+    // The eyes for which the cut is selected. Without a value, `eyes` is used.
     std::optional<Eyes> chooser = {};
-    // Whether a frame with a pool draws only the pages that are resident, and neither
-    // brings in nor requests any pages.
+    // Only for a frame with a pool: whether it draws just the resident pages, without
+    // bringing in or requesting others.
     bool is_aside = false;
-    // Per bundle: the colours of clusters in host memory, as SH coefficients of degree
-    // 0, [C][3]. An empty vector keeps the gaussians' colours.
+    // For each bundle, the colours of its clusters in host memory, as SH coefficients
+    // of degree 0, [C][3]. If the vector is empty, the gaussians keep their colours.
     std::vector<const float*> cluster_colors = {};
-    // Channels beside colour, and the meshes of the only eye.
+    // Channels other than colour, and meshes. Only with a single eye.
     SensorRequest sensor = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
-    // Returns whether every backend can draw the request. Other requests are drawn on
-    // the host only.
+    // Returns whether every backend can draw the request. Other requests can only be
+    // drawn on the host.
     bool is_plain() const {
         return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty() &&
                !sensor.channels.clipped;
     }
 };
 
-// The request for pictures of one size, each with a cut for its own camera. The rule
-// has no budget.
+// The request for a batch of pictures of one size. Each picture has its own camera and
+// cut. The rule must not have a budget.
 struct BatchRequest {
     SelectRule rule;
-    Shade shade;  // ignores `with_depth`: depth is drawn if there are planes for it
+    Shade shade;  // `with_depth` is ignored: depth is drawn if there is a plane for it
     int width, height;
     BatchPlanes planes;
-    // Channels and meshes of the pictures, one after another.
+    // Channels and meshes of the pictures. The planes hold the pictures one after
+    // another.
     Sensor sensor = {};
 };
 

@@ -20,9 +20,9 @@ namespace v3dg {
 
 namespace {
 
-// A workspace that is reused from frame to frame. One caller at a time can take it;
-// concurrent callers get new ones. It is a single atomic pointer, because a mutex could
-// stay locked in the child of a fork().
+// A workspace that is reused from frame to frame. Only one caller at a time can take
+// it; concurrent callers get new workspaces. The pointer is atomic instead of guarded
+// by a mutex, because a mutex could stay locked in the child of a fork().
 class SharedWorkspace {
   public:
     // The exchange is atomic, because threads may still be drawing when the process
@@ -32,7 +32,7 @@ class SharedWorkspace {
         std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
         return kept ? std::move(kept) : std::make_unique<Workspace<float>>();
     }
-    // Keeps the workspace for the next frame, unless its memory is exceptionally large.
+    // Keeps the workspace for the next frame, unless it is exceptionally large.
     void give_back(std::unique_ptr<Workspace<float>> workspace) {
         constexpr uint64_t kMostRoom = uint64_t(16) << 20;
         if (workspace->most_room <= kMostRoom) workspace.reset(kept_.exchange(workspace.release()));
@@ -109,19 +109,19 @@ std::vector<int64_t> levels_of(const HostScene& scene, const GivenCut& given) {
     return levels;
 }
 
-// Returns false colours of the pairs, [S][3], which replace the colours of the
-// gaussians. Empty if the request has no false colours. `tolerance_px2` is the
-// tolerance of the cut.
+// Returns the false colours of the pairs, [S][3], which replace the colours of the
+// gaussians. If the request has no false colours, the result is empty. `tolerance_px2`
+// is the tolerance of the cut.
 std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
                            const SelectRule& rule, const GivenCut& given, float tolerance_px2) {
     const bool is_metric = request.look == FrameLook::metrics;
     if (!is_metric && request.look != FrameLook::missing) return {};
-    // Metrics depend on the eye that views the picture; missing pages on the eye for
-    // which the cut was selected.
+    // Metrics are shown for the eye that views the picture. Missing pages are shown for
+    // the eye for which the cut was selected.
     const Camera& judge = is_metric ? request.eyes.camera[0] : request.choosing_eyes().camera[0];
-    // The tolerance that the tints show. For missing pages without a budget, it is the
-    // requested tolerance, because the pool may have raised the tolerance of the cut.
-    // Otherwise, it is the tolerance of the cut.
+    // The tolerance to compare metrics with. To show missing pages without a budget,
+    // use the requested tolerance, because the pool may have raised the tolerance of
+    // the cut. In all other cases, use the tolerance of the cut.
     const bool wants_used = is_metric || rule.budget != kNoBudget;
     const float wanted = wants_used ? tolerance_px2 : request.rule.tolerance_px2;
     std::vector<float> tint(3 * given.instance.size);
@@ -131,7 +131,7 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
-        // 1.0001 is a margin for the rounding of metrics.
+        // The factor 1.0001 is a margin for rounding of metrics.
         const Rgb rgb =
             is_metric ? Rgb{grey, grey, grey}
                       : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
@@ -152,16 +152,16 @@ void select_for(const HostScene& scene, const FrameRequest& request, const Selec
                 out);
 }
 
-// Sets the channel `clipped` of a picture of these pairs.
+// Sets the channel `clipped` of a picture from the given pairs.
 void clip_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
                 const Window& window, uint8_t* clipped, const std::atomic<bool>* stop) {
     const PixelSlopes slopes(camera.pinhole());
     mark_clipped(CutDraws(scene, camera, given).draws(), slopes, window, clipped, stop);
 }
 
-// Sets the channel `clipped` of a picture whose cut has this tolerance. A cut leaves
-// out clusters before the near plane and beside the frustum, so the whole cut is
-// selected.
+// Sets the channel `clipped` of a picture whose cut has this tolerance. The cut that
+// was drawn omits clusters in front of the near plane or beside the frustum. Therefore
+// the cut is selected again, without culling.
 void clip_selected(const HostScene& scene, const Camera& camera, SelectRule rule,
                    float tolerance_px2, const Window& window, uint8_t* clipped,
                    const std::atomic<bool>* stop) {
@@ -183,7 +183,7 @@ SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
     const GivenCut& given = *request.cut;
     std::vector<float> tint;
     if (request.look == FrameLook::metrics) {
-        // Throws if a pair is not in the scene.
+        // CutDraws throws an error if a pair is not in the scene.
         static_cast<void>(CutDraws(scene, camera, given));
         tint = tint_of(scene, request, rule, given, rule.tolerance_px2);
     }
@@ -224,7 +224,7 @@ SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& reque
     return counts;
 }
 
-// Returns the picture of camera k in the planes of a batch.
+// Returns the picture of camera k, whose planes are part of those of a batch.
 Picture<float> picture_of(const BatchRequest& request, size_t k) {
     const size_t num_pixels = static_cast<size_t>(request.width) * request.height;
     const BatchPlanes planes = request.planes.from(k * num_pixels);
@@ -278,7 +278,8 @@ void cpu::draw_batch(const HostScene& scene, const BatchRequest& request,
     shared.runs = {runs.data(), runs.size()};
     std::vector<Workspace<float>> workspaces(std::min(count, num_threads));
     const auto draw = [&](size_t k) {
-        // A nested parallel loop has one thread, whose number is 0.
+        // Inside a nested parallel loop, there is one thread with the index 0, so each
+        // thread uses its own workspace.
         Workspace<float>& workspace = workspaces[thread_index()];
         counts[k] = draw_picture(shared, request, cameras, k, workspace);
     };

@@ -1,5 +1,5 @@
-// Implements scene_frame_cuda.h: enqueues the cut that writes a frame's items, and sets
-// the models of the batch.
+// Implements scene_frame_cuda.h: enqueues the cut, which writes a frame's items, and
+// sets the models of the batch.
 
 #include "draw/scene_frame_cuda.h"
 
@@ -190,8 +190,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
-            // A frame that is drawn again reports no page requests, because the next
-            // frame may already be reporting its own.
+            // A frame that is drawn again must not report page requests, because the
+            // next frame may already be reporting its own.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },
@@ -227,7 +227,7 @@ std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
 
 constexpr unsigned kModelThreads = 128;
 
-// One thread per item.
+// Launched with one thread per item.
 static __global__ void model_kernel(ModelTables tables, ModelTables* on_device,
                                     Appearance<float> appearance, ItemList items) {
     const unsigned long long i =

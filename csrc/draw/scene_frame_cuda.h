@@ -1,7 +1,7 @@
 #pragma once
 
-// Frames of a scene on a CUDA device, which enqueue the drawing of a request, and the
-// models that frames draw.
+// Draws frames of a scene on a CUDA device by enqueuing the work of a request. Also has
+// the models that frames draw.
 
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
@@ -30,12 +30,12 @@ class PackedModel {
     PackedPlanes packed_;
 };
 
-// The coded gaussians of a model, on the device that is current at construction. All
-// records are contiguous, and so are all SH codes, so that the address of a row follows
-// from its index.
+// The coded gaussians of a model, on the device that is current at construction. The
+// codes of all records, and all SH codes, are contiguous, so that the address of a row
+// follows from its index.
 class CodedModel {
   public:
-    // Returns when the codes are on the device.
+    // Returns after the codes have been copied to the device.
     CodedModel(const CodedPages& pages, cudaStream_t stream);
     const Codes& codes() const { return codes_; }
     size_t bytes() const {
@@ -49,7 +49,7 @@ class CodedModel {
     Codes codes_;
 };
 
-// The gaussians of a bundle. One of the two pointers is set.
+// The gaussians of a bundle. Exactly one of the two pointers is set.
 struct DeviceModel {
     std::shared_ptr<const PackedModel> packed;
     std::shared_ptr<const CodedModel> coded;
@@ -58,8 +58,8 @@ struct DeviceModel {
 // The colours of the clusters of one bundle, on the device.
 class DevicePalette {
   public:
-    // `sh` is (C, 3), SH coefficients of degree 0 in host memory. The caller may reuse
-    // this memory on return.
+    // `sh` is (C, 3): SH coefficients of degree 0 in host memory. The constructor
+    // copies them.
     DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables,
                   cudaStream_t stream);
     Palette palette() const;
@@ -69,11 +69,10 @@ class DevicePalette {
     DeviceBuffer<float> sh_;
 };
 
-// Combines the pictures of two eyes into one frame.
+// Combines the pictures of two eyes in one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
-// The memory of a batch in progress: copies of its cameras, and the counts of its
-// images.
+// Memory of a batch in progress: copies of its cameras, and counts of its images.
 struct BatchTables {
     BatchTables(uint32_t num_cameras, cudaStream_t stream)
         : cameras(num_cameras, stream), counts(num_cameras, stream) {}
@@ -84,47 +83,48 @@ struct BatchTables {
 
 class BatchDrawing;
 
-// Draws a scene whose tables are on the device: selects a cut, then draws the cut.
+// Draws a scene whose tables are on the device. It selects a cut and draws it.
 class SceneFrame {
   public:
-    // Sets the gaussians of each bundle of the scene and, unless `palettes` is empty,
-    // the colours of the bundles' clusters. The caller may reuse host memory on return.
+    // Sets the gaussians of each bundle of the scene. Also sets the colours of the
+    // bundles' clusters, unless `palettes` is empty. Host memory is copied before the
+    // function returns.
     void set_models(std::vector<DeviceModel> models,
                     std::vector<std::shared_ptr<const DevicePalette>> palettes,
                     cudaStream_t stream);
 
-    // Enqueues a plain request (FrameRequest::is_plain). `pictures` are the pictures to
-    // draw, with the channels and meshes of `sensors`; `place` sets their destinations.
-    // With `pages`, it first brings in pages that are ready, then draws the resident
-    // part of the pool's bundles. `rule` is the request's rule after the pacing of a
-    // budget; it is set to the rule that was used.
+    // Enqueues a plain request (FrameRequest::is_plain). `pictures` describes the
+    // pictures, and `sensors` their channels and meshes. `place` sets the destinations.
+    // With `pages`, pages that are ready are brought in first, and then the resident
+    // part of the pool's bundles is drawn. `rule` is the request's rule after the
+    // pacing of a budget; on return, it is the rule that was used.
     //
     // The scene, the pool and a given cut must exist until the drawing is finished. A
-    // given cut is on the device and has one picture. If the frame is drawn again, it
-    // uses the pages that are resident at that time.
+    // given cut must be on the device, and allows only one picture. If the frame is
+    // drawn again, it uses the pages that are resident at that time.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, DevicePages* pages,
                                   const FrameRequest& request, SelectRule& rule,
                                   const EyeImages& pictures, const FrameSensors& sensors,
                                   cudaStream_t stream, const Frame::Place& place);
 
-    // Draws a picture for each camera of a batch, in parts if the batch is large. Like
-    // draw(), but it writes the planes of the request. The first kernels read the
+    // Draws a picture for each camera of a batch, in parts if the batch is large.
+    // Unlike draw(), it writes to the planes of the request. The first kernels read the
     // cameras.
     std::unique_ptr<BatchDrawing> draw_batch(const SceneTables& scene, const BatchRequest& request,
                                              const CameraArrays& arrays, uint32_t num_cameras,
                                              cudaStream_t stream);
 
-    // Returns the device memory in bytes, by part, without the models.
+    // Returns the device memory in bytes, one entry per purpose, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
   private:
     friend class BatchDrawing;
-    // Returns memory that no other batch in progress uses.
+    // Returns memory that is not used by another batch in progress.
     std::shared_ptr<BatchTables> tables_for(uint32_t num_cameras, cudaStream_t stream);
     // Draws cameras [first, first + count) of a batch.
     std::unique_ptr<Drawing> draw_part(const BatchDrawing& batch, uint32_t first, uint32_t count,
                                        CameraSource source);
-    // Halves the number of cameras of all later parts.
+    // Halves the number of cameras in all later parts.
     void halve_parts(uint32_t num_cameras);
 
     std::unique_ptr<Drawing> draw_selected(const SceneTables& scene, const Eyes& eyes,
@@ -138,7 +138,7 @@ class SceneFrame {
     std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const FrameRequest& request,
                                         const EyeImages& pictures, const FrameSensors& sensors,
                                         cudaStream_t stream, const Frame::Place& place);
-    // Returns the batch that draws the models.
+    // Returns the input of a frame that draws the models.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                      const FrameSensors& sensors, cudaStream_t stream);
 
@@ -149,29 +149,29 @@ class SceneFrame {
     DeviceBuffer<CodedGaussians> coded_;
     bool has_packed_ = false, has_coded_ = false;
     DeviceBuffer<Placement> placements_;
-    DeviceBuffer<InstanceFactors> factors_;  // one per place of a batch
+    DeviceBuffer<InstanceFactors> factors_;  // one element per instance slot of a batch
     DeviceBuffer<FrameImage> images_;
-    uint32_t most_cameras_ = ~0u;                       // largest number of cameras in a part
+    uint32_t most_cameras_ = ~0u;                       // maximum number of cameras in a part
     std::vector<std::shared_ptr<BatchTables>> tables_;  // memory of batches
-    // Memory that captured graphs continue to use.
+    // Memory that captured graphs still use.
     std::vector<std::shared_ptr<BatchTables>> captured_tables_;
     Cut cut_;
     Frame frame_;
 };
 
-// A batch that was enqueued. The frame, the scene and the planes must outlive it.
+// A batch that was enqueued. Its frame, scene and planes must outlive it.
 class BatchDrawing {
   public:
-    // Waits until the device has finished. finish() may still draw parts of the batch
-    // again.
+    // Waits until the device has finished. Parts may still be missing: finish() draws
+    // them again if a buffer was too small.
     void wait() const;
     // Waits until the pictures are drawn. Parts for which a buffer was too small are
     // drawn again, in smaller parts if memory does not suffice. Throws OutOfMemory or
-    // std::length_error if memory does not suffice for a single camera.
+    // std::length_error if memory does not even suffice for one camera.
     void finish();
-    // Returns the counts of each image. Waits. Call it after finish().
+    // Waits, and returns the counts of each image. Call it after finish().
     std::vector<ImageCounts> counts() const;
-    // Returns the sum over all parts. Call it after finish().
+    // Returns the times summed over all parts. Call it after finish().
     FrameTimes times() const;
     size_t num_parts() const { return parts_.size(); }
     bool is_captured() const { return is_captured_; }
@@ -199,7 +199,7 @@ class BatchDrawing {
     std::vector<Part> parts_;
 };
 
-// A model, and the camera in front of which it is placed.
+// A model, and its placement in front of the camera.
 struct ModelTables {
     GaussianRows<const float> rows;
     PackedPlanes packed;

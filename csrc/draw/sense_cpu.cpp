@@ -1,5 +1,5 @@
-// The sensor pass of a frame on the CPU: finds the normal and the instance of each
-// record, walks the tiles in parallel, and marks pixels that the near plane clips.
+// The sensor pass of a frame on the CPU. It finds the normal and the instance of each
+// record, processes the tiles in parallel, and marks pixels that the near plane clips.
 
 #include "draw/sense.h"
 
@@ -37,7 +37,7 @@ Gaussian3d<float> gaussian_of(const Draw<float>& draw, uint64_t index) {
     return g;
 }
 
-// Returns the end of each draw's gaussians, counted over all draws.
+// Returns the end of each draw's gaussians in the concatenation of all draws.
 std::vector<uint64_t> ends_of(const std::vector<Draw<float>>& draws) {
     std::vector<uint64_t> ends;
     uint64_t end = 0;
@@ -55,7 +55,7 @@ void for_each_source(const Workspace<float>& ws, const std::vector<Draw<float>>&
         std::upper_bound(end_of_draw.begin(), end_of_draw.end(), ws.source.data()[first]) -
         end_of_draw.begin());
     for (uint64_t r = first; r < end; ++r) {
-        const uint64_t gaussian = ws.source.data()[r];  // ascending in a chunk
+        const uint64_t gaussian = ws.source.data()[r];  // ascending within a chunk
         while (end_of_draw[d] <= gaussian) ++d;
         visit(r, d, gaussian + draws[d].count - end_of_draw[d]);
     }
@@ -68,7 +68,7 @@ void set_normal(const Draw<float>& draw, uint64_t index, float normal[3]) {
     normal_of_gaussian(g.quat, g.scale, draw.view, p, normal);
 }
 
-// Sets what the channels need of each record.
+// Computes the data of each record that the channels need.
 SensedRecords sensed_records(const std::vector<Draw<float>>& draws, const DrawnSensor& sensor,
                              Workspace<float>& ws) {
     const SensorPlanes& planes = sensor.sensor.planes;
@@ -89,7 +89,7 @@ SensedRecords sensed_records(const std::vector<Draw<float>>& draws, const DrawnS
     return sensed;
 }
 
-// Returns the axes of a gaussian in view space as columns, row major.
+// Returns the axes of a gaussian in view space, as columns of a row-major matrix.
 void axes_of(const Gaussian3d<float>& g, const ModelView<float>& view, double axes[9]) {
     float r[9];
     rotation_of_quat(g.quat, r);
@@ -101,7 +101,7 @@ void axes_of(const Gaussian3d<float>& g, const ModelView<float>& view, double ax
         }
 }
 
-// Appends the clipped bodies of some gaussians of a draw.
+// Appends the clipped bodies among some gaussians of a draw.
 void add_bodies(const Draw<float>& draw, uint64_t first, uint64_t last, double near_depth,
                 std::vector<ClippedBody>& bodies) {
     for (uint64_t i = first; i < last; ++i) {
@@ -122,7 +122,8 @@ void add_bodies(const Draw<float>& draw, uint64_t first, uint64_t last, double n
 std::vector<ClippedBody> bodies_of(const std::vector<Draw<float>>& draws, double near_depth,
                                    const std::atomic<bool>* stop) {
     constexpr uint64_t kTogether = 4096;
-    std::vector<std::pair<size_t, uint64_t>> parts;  // draw, first gaussian
+    std::vector<std::pair<size_t, uint64_t>> parts;  // each element: draw, index of the
+                                                     // first gaussian
     for (size_t d = 0; d < draws.size(); ++d)
         for (uint64_t first = 0; first < draws[d].count; first += kTogether)
             parts.emplace_back(d, first);

@@ -1,5 +1,5 @@
-// Finds the normal and the instance of each record of a frame. A warp takes an item, a
-// lane a record.
+// Finds the normal and the instance of each record of a frame. A warp processes an
+// item, and a lane one record.
 
 #include "base/launch.cuh"
 #include "draw/sensed_records.h"

@@ -1,5 +1,5 @@
-// Views of the same gaussians: their items, their backward pass, and idle frames for
-// the next ones.
+// Draws several views of the same gaussians, with a backward pass. Idle frames are kept
+// for reuse.
 
 #include "draw/views_frame_cuda.h"
 
@@ -23,14 +23,14 @@ constexpr size_t kMostRecords = size_t(1) << 25;
 
 constexpr unsigned kItemThreads = 128;
 
-// The items of all views. Each view has `num_items` items.
+// The items of all views; each view has `num_items` of them.
 struct ViewItems {
     unsigned long long num_gaussians;
     uint32_t num_views, num_items;
     Appearance<float> appearance;
 };
 
-// One thread per item.
+// Launched with one thread per item.
 __global__ void view_items_kernel(ViewItems views, ItemList items) {
     const unsigned long long i =
         blockIdx.x * static_cast<unsigned long long>(blockDim.x) + threadIdx.x;
@@ -67,7 +67,7 @@ ViewsFrame::ViewsFrame() {
 ViewsFrame::~ViewsFrame() {
     for (const cudaEvent_t event : {drawn_, gone_back_})
         if (event != nullptr) cudaEventDestroy(event);
-    // Ignore errors. At exit the driver may be unloaded before this object is
+    // Ignore errors, because at exit the driver may be unloaded before this object is
     // destroyed.
     cudaGetLastError();
 }
@@ -168,8 +168,8 @@ struct IdleViewsFrames {
 };
 
 IdleViewsFrames& idle_views_frames() {
-    // The object is never destroyed: at exit, the driver may be unloaded before static
-    // objects are destroyed.
+    // This object is never destroyed, because at exit the driver may be unloaded before
+    // static objects are destroyed.
     static IdleViewsFrames& frames = *new IdleViewsFrames;
     return frames;
 }

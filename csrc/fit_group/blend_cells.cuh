@@ -1,8 +1,8 @@
 #pragma once
 
-// Blends cells of 4 x 4 pixels with half-warps, and computes gradients by visiting the
-// same gaussians again. For each gaussian and cell, the gradient is summed over the
-// cell's pixels and stored in a slot.
+// Blends cells of 4 x 4 pixels with half-warps. To compute gradients, it visits the
+// same gaussians again. The gradient of a gaussian is summed over the pixels of each
+// cell, and stored in a slot.
 
 #include "fit_group/cell_lists.cuh"
 #include "frame/record.cuh"
@@ -13,7 +13,7 @@ namespace cuda {
 
 enum class Pass { measure, draw, train };
 
-// The pixel of a lane, in the cell of its half-warp.
+// A lane's pixel, in the cell of its half-warp.
 struct CellPixel {
     int x, y;
     float center_x, center_y;
@@ -35,8 +35,7 @@ struct alignas(kAtOnce * sizeof(Index)) CellEntries {
 };
 
 // Copies the records of entries [begin, end) of both half-warps' lists to shared
-// memory. For small groups there is nothing to do: their records are always in shared
-// memory.
+// memory. Does nothing for small groups, whose records are always in shared memory.
 template <class Fit>
 __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     if (Fit::kSmall) return;
@@ -76,7 +75,7 @@ __device__ CellRecords records_at(const Fit& fit, const CellList<Fit>& list, uin
     return out;
 }
 
-// Sums a value over the pixels of the lane's cell, in every lane.
+// Sums a value over the pixels of the lane's cell. Every lane gets the sum.
 __device__ inline float cell_sum(float x) {
 #pragma unroll
     for (int offset = kCellPixels / 2; offset > 0; offset /= 2)
@@ -84,7 +83,7 @@ __device__ inline float cell_sum(float x) {
     return x;
 }
 
-// The contributions of kAtOnce gaussians to a pixel, front to back.
+// The contributions of kAtOnce gaussians to a pixel, in blending order.
 struct Blended {
     float alpha[kAtOnce], before[kAtOnce], weight[kAtOnce];
     float3 color[kAtOnce];
@@ -95,8 +94,8 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     Blended out;
 #pragma unroll
     for (int q = 0; q < kAtOnce; ++q) {
-        // Read the record as vectors (frame/record.cuh), because nvcc rounds the
-        // falloff of a copied record differently.
+        // Read the record as vectors (frame/record.cuh). If the code copied it first,
+        // nvcc would round the falloff differently.
         const Record<float>& r = *records.record[q];
         const float4 a = *reinterpret_cast<const float4*>(&r.u);
         const float4 b = *reinterpret_cast<const float4*>(&r.l22);
@@ -107,24 +106,24 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     return out;
 }
 
-// The outputs of a pass. A pass leaves the outputs of other passes unused.
+// The outputs of a pass. Each pass uses only some of them.
 struct BlendTargets {
-    float* slots;          // for Pass::train
+    float* slots;          // used by Pass::train
     uint32_t slot_base;    // index of the first slot in `slots`
-    const float* d_dssim;  // for Pass::train; may be null
-    float* picture;        // for Pass::draw
-    float2* errors;        // for Pass::measure
+    const float* d_dssim;  // used by Pass::train; may be null
+    float* picture;        // used by Pass::draw
+    float2* errors;        // used by Pass::measure
 };
 
-// The number of lanes that sum the fragments of one gaussian: 1, or 2 if a chunk has
-// fewer gaussians than a half-warp has lanes.
+// Number of lanes that sum the fragments of one gaussian. It is 2 if a chunk has fewer
+// gaussians than a half-warp has lanes, and otherwise 1.
 template <class Fit>
 constexpr int kLanesOfSum = kCellPixels / (Fit::kChunk < kCellPixels ? Fit::kChunk : kCellPixels);
 
 // Computes the gradient of record r, which is gaussian `i` of the chunk, summed over
 // the half-warp's cell. All lanes must call it; lanes without a gaussian pass a null
-// `slot`. The sums are not written with RowSums: nvcc would round them differently,
-// which would change the bits of bundles.
+// `slot`. The code does not use RowSums, because nvcc would round those sums
+// differently, which would change the bits of bundles.
 template <class Fit>
 __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r,
                        float* slot) {
@@ -173,8 +172,8 @@ __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Rec
         if (kLanes == 1 || (k < 5) == (part == 0)) slot[k] = all[k];
 }
 
-// Blends two horizontally adjacent cells in view b. All lanes of the warp must call it.
-// `unit` is the index of the pair of cells.
+// Blends two horizontally adjacent cells in view b. `unit` is the index of the pair of
+// cells. All lanes of the warp must call it.
 template <Pass kPass, class Fit>
 __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, int pair_x,
                             int cell_y, uint32_t unit, const BlendTargets& targets) {
@@ -232,7 +231,7 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
                               loss.l1 / (3 * pixels), loss.alpha / pixels};
     float of_cell[4] = {0, 0, 0, 0};
     if (loss.cells > 0) {
-        // Pixels outside of the picture have no difference.
+        // Pixels outside the picture have no difference.
         for (int k = 0; k < 4; ++k)
             of_cell[k] = cell_slope(loss, cell_sum(difference[k]), weights[k]);
     }
@@ -245,7 +244,7 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     fit.d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
     // Blend the same records again, with the same results. Gradients need the sums over
-    // all records, which are known now.
+    // all records, which are only known now.
     const auto slot_of = [&](uint32_t j) {
         const uint32_t slot =
             fit.slot_first(region)[j] + __popcll(fit.mask(region)[j] & ((CellMask(1) << cell) - 1));
@@ -285,7 +284,7 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
         }
         __syncwarp();
     }
-    // The gradients of the remaining records are 0, because all pixels have stopped.
+    // All pixels have stopped, so the gradients of the remaining records are 0.
     for (uint32_t i = begin + lane % kCellPixels; i < list.length; i += kCellPixels) {
         float* slot = slot_of(list.entry[i]);
         for (int k = 0; k < kSums; ++k) slot[k] = 0;
@@ -301,13 +300,14 @@ __device__ int cell_pairs(const Fit& fit) {
     return (fit.job.size + 2 * kCell - 1) / (2 * kCell);
 }
 
-// Maps 0, 1, 2, ... to the middle of [0, size), then alternately to both sides of it.
+// Maps 0, 1, 2, ... to the middle of [0, size), then to its neighbours on alternating
+// sides.
 __device__ inline int from_middle(int k, int size) {
     return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2);
 }
 
 // Blends all pairs of cells of some regions. Warps claim pairs from a counter. Pairs in
-// the middle come first, because their lists are longest.
+// the middle are claimed first, because their lists are longest.
 template <Pass kPass, class Fit>
 __device__ void blend_regions(const Fit& fit, const FitCameras& cameras, int num_views,
                               int first_region, int last_region, const BlendTargets& targets) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// Lists the gaussians that reach each cell of 4 x 4 pixels. A record has a mask of
-// cells, and a gradient slot for each of these cells.
+// Lists the gaussians that reach each cell of 4 x 4 pixels. A record has a mask of its
+// cells, and a gradient slot for each of them.
 
 #include "base/scan.cuh"
 #include "fit_group/depth_order.cuh"
@@ -10,8 +10,8 @@ namespace v3dg {
 namespace cuda {
 
 // Returns a mask of the cells of the region at (left, top) that the record may reach,
-// row by row. The test rounds to pixel centres, because each cell costs a slot and a
-// list entry.
+// row by row. The test rounds to pixel centres, because every cell in the mask needs a
+// slot and a list entry.
 __device__ inline CellMask cells_of(const Record<float>& r, int left, int top) {
     const PixelBox<int> box{max(r.x0 - left, 0), min(r.x1 - left, kRegion - 1), max(r.y0 - top, 0),
                             min(r.y1 - top, kRegion - 1)};
@@ -32,8 +32,8 @@ __device__ inline CellMask cells_of(const Record<float>& r, int left, int top) {
     return reached;
 }
 
-// Sorts the records of a large group by depth, computes their cells, and waits for the
-// team.
+// Sorts the records of a large group by depth, and computes their cells. Then waits for
+// the team.
 template <class Fit>
 __device__ void arrange_by_depth(const Fit& fit, int num_views) {
     for (uint32_t r = fit.first(); r < num_views * fit.n_padded; r += fit.stride()) {
@@ -50,7 +50,8 @@ __device__ void arrange_by_depth(const Fit& fit, int num_views) {
     fit.sync();
 }
 
-// Assigns each record one slot per cell, region by region. Returns the number of slots.
+// Assigns one slot per cell to each record, region by region. Returns the number of
+// slots.
 template <class Fit>
 __device__ uint32_t assign_slots(const Fit& fit, int num_views) {
     const uint32_t used = num_views * fit.n_padded, count = fit.num_regions() * used;
@@ -111,17 +112,17 @@ __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uin
     }
 }
 
-// The list of a half-warp's cell: ranks of records, nearest first. Both half-warps have
-// lists of the same length. `filled` is the length without padding; padding is the rank
-// of an empty record.
+// The list of a half-warp's cell: ranks of records, nearest first. The lists of both
+// half-warps have the same length. The shorter list is padded with the rank of an empty
+// record; `filled` is its length without padding.
 template <class Fit>
 struct CellList {
     const typename Fit::Index* entry;
     uint32_t length, filled;
 };
 
-// Writes the lists of two horizontally adjacent cells in view b, and returns the list
-// of this lane's cell. `cell` is the bit of the left cell in masks.
+// Writes the lists of two horizontally adjacent cells in view b. Returns the list of
+// this lane's cell. `cell` is the bit of the left cell in masks.
 template <class Fit>
 __device__ CellList<Fit> make_lists(const Fit& fit, int b, int region, int cell) {
     constexpr int kLoads = 4;

@@ -1,6 +1,6 @@
 #pragma once
 
-// The loss of a group's pictures on the CPU, and its gradient.
+// Computes the loss of a group's pictures on the CPU, and its gradient.
 
 #include <algorithm>
 #include <vector>
@@ -11,13 +11,13 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// Draws the student (the gaussians being fitted), compares the picture with its target,
-// and accumulates gradients.
+// Draws the student (the gaussians that are fitted), compares the picture with its
+// target, and accumulates gradients.
 class Comparison {
   public:
     Comparison(const FitConfig& config) : config_(config) {}
 
-    // Adds the mean |difference| of colour and of alpha in one view to `error`.
+    // Adds the mean absolute differences of colour and of alpha in one view to `error`.
     void residual(const Student& student, const FitView& view, const FitImage& target,
                   double error[2]) {
         draw(student, view);
@@ -74,8 +74,8 @@ class Comparison {
         return count;
     }
 
-    // Computes the L1 parts of the loss in one tile. Adds those of pixels to `error`.
-    // Unless `grad` is null, also computes the gradients of the tile's pixels.
+    // Computes the L1 parts of the loss in one tile, and adds the part of each pixel to
+    // `error`. If `grad` is not null, also computes the gradients of the tile's pixels.
     void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad,
                  double error[2]) {
         using V = Vec<float>;
@@ -116,8 +116,7 @@ class Comparison {
         error[1] += sum_of(alpha_sum) / num_pixels;
     }
 
-    // Adds the gradient of the mean differences of a block, which is a cell of the
-    // loss.
+    // Adds the gradient of a block's mean differences. A block is a cell of the loss.
     void add_cell_slopes(int block, const TilePlanes<float>& tile, const float* planes,
                          float d_color, float d_alpha, TileGradient<float>& grad) {
         using V = Vec<float>;

@@ -1,25 +1,26 @@
 #pragma once
 
-// Sorts the gaussians of each view by depth, and by index where depths are equal.
+// Sorts the gaussians of each view by depth. Gaussians of equal depth are sorted by
+// index.
 
 #include "fit_group/team.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// The key of gaussians that are not drawn. It is larger than all depths.
+// The key of gaussians that are not drawn. It is larger than the key of any depth.
 constexpr uint32_t kHiddenKey = 0xfffffffeu;
 
-// Computes the rank of gaussian `i` in its view, and writes `i` at that position.
-// `view_keys` are the keys of the view.
+// Computes the rank of gaussian `i` in its view, and writes `i` to that position.
+// `view_keys` has the keys of the view.
 template <class Fit>
 __device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_t begin,
                               uint32_t i) {
     const uint4* all = reinterpret_cast<const uint4*>(view_keys);
     const uint32_t key = view_keys[i], warp_first = i - threadIdx.x % 32;
     uint32_t rank = 0;
-    // Equal keys are ordered by index. So an equal key in an earlier run of 32
-    // gaussians precedes `key`, and an equal key in a later run follows it.
+    // Equal keys are ordered by index. Therefore an equal key in an earlier run of 32
+    // gaussians counts as smaller, and one in a later run as larger.
     const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
         for (uint32_t run = from; run < to; run += 32) {
             uint4 other[8];
@@ -49,7 +50,7 @@ __device__ void rank_by_counting(const Fit& fit, int num_views) {
         return;
     }
     // All threads read all keys, so copy the keys to shared memory if there is room.
-    // The memory is used for fragments later.
+    // The same memory later holds the fragments.
     auto* copy = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
     const bool fits = fit.n_padded * sizeof(uint32_t) <= Fit::kWarps * fragments_bytes(Fit::kChunk);
     for (int b = 0; b < num_views; ++b) {
@@ -92,7 +93,8 @@ __device__ void sort_bitonic(const Fit& fit, int b) {
     __syncthreads();
 }
 
-// Sorts the gaussians of each view by depth, and by index where depths are equal.
+// Sorts the gaussians of each view by depth. Gaussians of equal depth are sorted by
+// index.
 template <class Fit>
 __device__ void order_by_depth(const Fit& fit, int num_views) {
     if (Fit::kSmall || fit.team_size > 1)

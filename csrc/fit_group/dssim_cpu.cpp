@@ -4,8 +4,9 @@
 
 namespace v3dg {
 
-// Applies the window, which is separable, in two passes. The operation is its own
-// transpose, because the window is symmetric and pixels beyond the border are zero.
+// Applies the window in two passes, which is possible because it is separable. The
+// operation is its own transpose, because the window is symmetric and pixels beyond the
+// border are zero.
 static void blur(const float* in, int width, int height, float* rows, float* out) {
     for (int y = 0; y < height; ++y)
         for (int x = 0; x < width; ++x) {

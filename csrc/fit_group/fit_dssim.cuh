@@ -1,6 +1,6 @@
 #pragma once
 
-// D-SSIM of a group's pictures on CUDA. dssim.h has the definition.
+// The D-SSIM of a group's pictures on CUDA. dssim.h defines it.
 
 #include "fit_group/team.cuh"
 #include "math/ssim.h"
@@ -8,15 +8,14 @@
 namespace v3dg {
 namespace cuda {
 
-// Computes the gradient of D-SSIM with respect to each picture, three planes per
-// picture.
+// Computes the gradient of D-SSIM with respect to each picture, which has three planes.
 template <class Fit>
 __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int num_views,
                                const float* pictures, float* d_pictures, float* all_maps) {
     const int size = fit.job.size;
     const uint32_t num_pixels = size * size, count = 3 * num_views * num_pixels;
     const float scale = -fit.in.config.loss.dssim / (3 * static_cast<float>(num_pixels));
-    // Adds up the maps within the window along rows (step = 1) or columns (step =
+    // Adds up the maps inside the window, along rows (step = 1) or columns (step =
     // size).
     const auto blur = [&](const float* maps, uint32_t i, int place, int step, auto& sums) {
 #pragma unroll

@@ -1,8 +1,8 @@
 #pragma once
 
-// Fits the gaussians of groups so that they look like the finer gaussians that they
-// replace. fit_group() fits one group on one CPU thread; fit_groups() fits all groups
-// of a level on CUDA.
+// Fits the gaussians of groups, so that they look like the finer gaussians that they
+// replace. fit_group() fits one group on one CPU thread, and fit_groups() fits all
+// groups of a level on CUDA.
 
 #include <atomic>
 #include <cstdint>
@@ -28,31 +28,31 @@ struct FitStep;  // defined in fit_group_math.h
 struct FitConfig {
     int steps;
     int views_per_step;
-    // The number of fixed views whose targets are kept, without the held-out views. 0:
-    // each visit uses a new view.
+    // Number of fixed views whose targets are kept, without the held-out views. If it
+    // is 0, each step uses a new view.
     int num_views;
     int supersample;  // targets are drawn this many times larger, then averaged
-    int image_size;   // px; 0: derived from px2_per_gaussian
-    // Area of the ball's footprint per gaussian, if image_size is 0.
+    int image_size;   // px; if 0, it is derived from px2_per_gaussian
+    // Area, px², of the ball's footprint per gaussian. Used if image_size is 0.
     float px2_per_gaussian;
-    float distance;    // distance of the camera from the centre, in radii
+    float distance;    // distance from the camera to the centre, in radii
     float filter_px2;  // filter of the fitted gaussians, px²
     bool antialiased;
     LossWeights loss;
-    // The step sizes of Adam. The step size of positions is in radii or, if
-    // `position_in_world`, in world units. Step sizes decay exponentially, to
-    // `final_step` times the initial value in the last step. `beta2` is Adam's decay of
-    // the mean of squared gradients.
+    // The step sizes of Adam. The step size of positions is relative to the radius or,
+    // if `position_in_world`, in world units. Step sizes decay exponentially to
+    // `final_step` times the initial value in the last step. `beta2` is Adam's decay
+    // rate of the mean of squared gradients.
     float step_position, step_log_scale, step_quat, step_logit, step_sh0, step_sh_rest;
     bool position_in_world;
     float final_step, beta2;
     uint64_t seed;
 };
 
-// One group: its target, its gaussians, and the ball that its views show.
+// One group: its target, the gaussians to fit, and the ball that its views show.
 struct FitGroup {
     uint64_t target_first, target_count;  // rows of the target model
-    uint64_t first, count;                // rows that are fitted
+    uint64_t first, count;                // rows of the gaussians to fit
     float center[3], radius;
     uint64_t stream;  // selects the group's sequence of random numbers
 };
@@ -63,14 +63,15 @@ struct FitTarget {
     bool antialiased;
 };
 
-// The progress of a fit, shared with the thread that waits for it.
+// The progress of a fit. It is shared with the thread that waits for the fit.
 struct FitProgress {
     std::atomic<uint64_t> groups_done{0};
     std::atomic<double> loss_sum{0};
     std::atomic<bool> cancel{false};
 };
 
-// A view of a group, in the group's coordinates: the ball is at 0 and has radius 1.
+// A view of a group, in the group's coordinates, in which the ball is at 0 and has
+// radius 1.
 struct FitView {
     float rotation[9];
     float focal, cx, cy;  // px
@@ -91,7 +92,7 @@ struct FitScratch {
 // px.
 void check_size(const FitConfig& config, const FitGroup& group);
 
-// Returns view `index` of a group. See held_out_view() for the indices of held-out
+// Returns view `index` of a group. held_out_view() returns the indices of held-out
 // views.
 FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index);
 
@@ -100,14 +101,14 @@ V3DG_DECLARE_PER_ISA(void fit_target(const FitConfig& config, const FitGroup& gr
                                      const FitTarget& target, const FitView& view,
                                      FitScratch& scratch, FitImage& image))
 
-// Fits one group. `rows` has the initial values, and receives the result, in world
+// Fits one group. `rows` has the initial values and receives the result, in world
 // units, with plain scales and opacities. `targets` has the pictures of the fixed
-// views, then the pictures of the held-out views. It is unused if there are no fixed
+// views, followed by those of the held-out views. It is not used if there are no fixed
 // views.
 //
-// `error` becomes the residual on the held-out views: the mean |difference| of colour
-// and of alpha. The initial values are kept if the result is not better on these views,
-// or not finite.
+// `error` receives the residual on the held-out views: the mean absolute differences of
+// colour and of alpha. If the result is not finite, or not better on these views, the
+// initial values are kept.
 V3DG_DECLARE_PER_ISA(void fit_group(const FitConfig& config, const FitGroup& group,
                                     const FitTarget& target, const FitImage* targets,
                                     const GaussianRows<float>& rows, float error[2],
@@ -115,14 +116,14 @@ V3DG_DECLARE_PER_ISA(void fit_group(const FitConfig& config, const FitGroup& gro
 
 namespace cuda {
 
-// Signals between a running fit and the host, in memory that both can access.
+// Signals between a running fit and the host. They are in memory that both can access.
 struct FitSignals {
     unsigned long long groups_done;
     unsigned long long loss_sum;  // in units of 2^-32
     int cancel;
 };
 
-// A group to fit, and where its pictures, views and residual are.
+// A group to fit, and the locations of its pictures, views and residual.
 struct FitJob {
     FitGroup group;
     uint64_t first_pixel;  // index of the job's first pixel in `targets`
@@ -131,14 +132,15 @@ struct FitJob {
     int size;              // side of the job's pictures, px
 };
 
-// The groups to fit, and their targets. All pointers are to device memory, also those
-// in `rows`.
+// The groups to fit, and their targets. All pointers, including those in `rows`, point
+// to device memory.
 struct FitGroupsInput {
     FitConfig config;
-    uint64_t stride;  // the result of visiting_stride()
+    uint64_t stride;  // returned by visiting_stride()
     Span<const FitJob> jobs;
-    const float4* targets;  // colour and alpha, picture by picture, row major
-    const FitView* views;   // one view per picture
+    const float4* targets;  // colour and alpha; one picture after another, in row-major
+                            // order
+    const FitView* views;   // one per picture
     const FitStep* steps;   // [config.steps]
     GaussianRows<float> rows;
     float* error;
@@ -148,20 +150,21 @@ struct FitGroupsInput {
 // Computes the step sizes of each step of Adam, in device memory.
 void make_steps(const FitConfig& config, FitStep* steps, Stream stream);
 
-// The size of a whole level. It determines how many blocks fit a group. All groups of
-// the level count, even if they are fitted in several batches. So the bits of the
-// result do not depend on free memory.
+// The size of a whole level, which determines how many blocks fit a group. It counts
+// all groups of the level, even if they are fitted in several batches. Therefore the
+// bits of the result do not depend on free memory.
 struct FitExtent {
     size_t num_groups;
-    uint32_t most;  // largest number of gaussians in a group
+    uint32_t most;  // maximum number of gaussians in a group
     int largest;    // largest side of a picture, px
 };
 FitExtent extent_of(Span<const FitJob> jobs);
 
-// Enqueues the fits of all groups. Each is like v3dg::fit_group(). Jobs should be
-// sorted by falling size. in.signals counts finished groups. When the host sets its
-// `cancel`, unfinished groups keep their initial values. Throws std::runtime_error if
-// CUDA reports an error, or if the device has too little shared memory.
+// Enqueues the fits of all groups, with the rules of v3dg::fit_group(). Jobs should be
+// sorted by descending size. The kernel counts finished groups in in.signals. When the
+// host sets its `cancel`, groups that are not finished keep their initial values.
+// Throws std::runtime_error if CUDA reports an error, or if the device has too little
+// shared memory.
 void fit_groups(const FitGroupsInput& in, const FitExtent& level, Stream stream);
 
 }  // namespace cuda

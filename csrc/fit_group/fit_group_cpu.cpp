@@ -1,5 +1,5 @@
-// Fits a group on the CPU, on a single thread. In the group's coordinates, the ball is
-// at the origin and has radius 1. So step sizes mean the same for every group, and
+// Fits a group on a single CPU thread. In the group's coordinates, the ball is at the
+// origin and has radius 1. Therefore a step size means the same for every group, and
 // groups far from the world's origin lose no precision.
 
 #include "fit_group/fit_group.h"

@@ -2,11 +2,12 @@
 // then claims the next one.
 //
 // In each step, threads project the gaussians and sort them by depth. Half-warps
-// process cells of 4 x 4 pixels: they list the gaussians that reach the cell, blend
-// them front to back, compare with the target, and visit the gaussians again to compute
-// gradients. Each gaussian has a slot per cell. Threads add up the slots in a fixed
-// order, propagate the sums to the parameters, and perform a step of Adam. So every run
-// has the same result, regardless of the order of blocks and warps.
+// process cells of 4 x 4 pixels. They list the gaussians that reach the cell, blend
+// them front to back, and compare the result with the target. Then they visit the
+// gaussians again to compute gradients. Each gaussian has a slot per cell. Threads add
+// up the slots in a fixed order, propagate the sums to the parameters, and perform a
+// step of Adam. Therefore every run gives the same result, in whatever order blocks and
+// warps run.
 
 #include "fit_group/fit_group.h"
 
@@ -23,7 +24,8 @@ namespace cuda {
 
 namespace {
 
-// The largest number of gaussians in a small group. Its picture is a single region.
+// Maximum number of gaussians in a small group. The picture of a small group is a
+// single region.
 constexpr uint32_t kSmallCount = 256;
 constexpr int kStepsPerPoll = 16;
 
@@ -36,8 +38,8 @@ __device__ void set_camera(const Fit& fit, FitCameras& cameras, int b, uint64_t 
         fit.in.targets + fit.job.first_pixel + picture * fit.job.size * fit.job.size;
 }
 
-// Adds the |difference| of colour and of alpha, summed over pixels, to `error` in every
-// thread.
+// Adds the absolute differences of colour and of alpha, summed over pixels, to `error`.
+// Every thread gets the sums.
 template <class Fit>
 __device__ void measure_views(const Fit& fit, const FitCameras& cameras, int num_views,
                               double error[2]) {
@@ -73,7 +75,7 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
     targets.slots = is_near ? fit.at(fit.layout.near_slots)
                             : reinterpret_cast<float*>(fit.scratch + fit.layout.far_slots);
     const uint32_t capacity = is_near ? num_slots : fit.layout.num_far_slots;
-    // Process as many regions at once as there is room for their slots.
+    // Process as many regions at once as there is memory for their slots.
     const auto slots_before = [&](int region) {
         return region < fit.num_regions() ? fit.slot_first(region)[0] : num_slots;
     };
@@ -107,7 +109,7 @@ __device__ void sum_errors(const Fit& fit, double error[2][2]) {
 }
 
 // Writes the result if its loss is at most the loss of the initial values. `error` has
-// sums over pixels, first of the initial values, then of the result.
+// sums over pixels: first for the initial values, then for the result.
 template <class Fit>
 __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
     const FitConfig& config = fit.in.config;
@@ -126,14 +128,14 @@ __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
 }
 
 // Visits the held-out views, then the views of all steps, then the held-out views
-// again, in batches of at most kViewsAtOnce views.
+// again. It processes up to kViewsAtOnce views at once.
 template <class Fit>
 __device__ void fit_one_group(const Fit& fit) {
     const FitConfig& config = fit.in.config;
     const int views_per_step = config.views_per_step;
     const int64_t num_visits = static_cast<int64_t>(config.steps) * views_per_step;
-    // Visits of steps have the numbers 0 to num_visits - 1. Visits of held-out views
-    // come before and after them.
+    // Visits in steps are numbered from 0 to num_visits - 1. The visits of held-out
+    // views have numbers before and after these.
     const auto views_at = [&](int64_t visit) {
         const int64_t left = visit < 0            ? -visit
                              : visit < num_visits ? views_per_step - visit % views_per_step
@@ -147,7 +149,7 @@ __device__ void fit_one_group(const Fit& fit) {
                                                              : 0;
     };
     const auto set_cameras = [&](FitCameras& cameras, int64_t first) {
-        // The thread's index in the last warp, which is the least busy one.
+        // The thread's index in the last warp, which has the least other work.
         const int b = static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);
         if (b == kViewsAtOnce && first >= 0 && first < num_visits)
             cameras.step = fit.in.steps[first / views_per_step];
@@ -159,7 +161,8 @@ __device__ void fit_one_group(const Fit& fit) {
                    is_of_step ? visited_view(config, fit.in.stride, visit)
                               : num_fitted_pictures(config) + held_out);
     };
-    double error[2][2] = {{0, 0}, {0, 0}};  // of the initial values, and of the result
+    double error[2][2] = {{0, 0}, {0, 0}};  // for the initial values, and for the
+                                            // result
     start_parameters(fit);
     set_cameras(fit.s.cameras[0], -kHeldOutViews);
     if (fit.leads()) fit.team.unit = 0;
@@ -194,7 +197,7 @@ __device__ void fit_one_group(const Fit& fit) {
 }
 
 // Computes the step sizes of all steps once, because powers are slow and all groups use
-// the same step sizes.
+// the same values.
 __global__ void steps_kernel(const FitConfig config, FitStep* steps) {
     const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < static_cast<unsigned>(config.steps)) steps[i] = fit_step(config, static_cast<int>(i));
@@ -211,8 +214,8 @@ __global__ void __launch_bounds__(Shape::kThreads, kBlocks)
     fit_groups_kernel(const FitGroupsInput in, const FitLayout layout, unsigned char* scratch,
                       unsigned num_blocks, FitTeam* teams, FitQueue* queue) {
     __shared__ FitShared s;
-    // Teams are formed in the order of arrival, so that a block waits only for blocks
-    // that are running or certain to run.
+    // A block's rank in its team follows from the order in which blocks arrive.
+    // Therefore a block only waits for blocks that are running or certain to run.
     if (threadIdx.x == 0) s.arrival = atomicAdd(&queue->arrived, 1u);
     __syncthreads();
     FitBlock<Shape> fit(in, layout, s, teams, num_blocks, scratch);
@@ -246,12 +249,13 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
-// Launches the kernel and returns true, if `blocks` blocks (at most kBlocks) fit on a
-// multiprocessor. Otherwise does nothing and returns false.
+// If `blocks` blocks (at most kBlocks) fit on a multiprocessor, launches the kernel and
+// returns true. Otherwise, does nothing and returns false.
 template <class Shape, int kBlocks>
 bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream,
          int blocks = kBlocks) {
-    // Shared memory per block that the kernel and the driver reserve, bytes.
+    // Shared memory per block, in bytes, that the kernel's variables and the driver
+    // need.
     const size_t reserved = sizeof(FitShared) + 1024;
     const size_t limit =
         (std::min<size_t>(
@@ -260,7 +264,7 @@ bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stre
         16 * 16;
     const size_t most_blocks =
         blocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // The number of blocks per group. All of them must run concurrently.
+    // Number of blocks per group. All of them must run concurrently.
     size_t num_blocks = 1;
     if (attribute(cudaDevAttrCooperativeLaunch) != 0)
         num_blocks = std::clamp<size_t>(
@@ -311,8 +315,8 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
     const uint32_t most = level.most;
     const int largest = level.largest;
     const auto multiprocessors = static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // If each multiprocessor has many groups to fit, three concurrent groups per
-    // multiprocessor are faster than two.
+    // If there are many groups per multiprocessor, fitting three of them concurrently
+    // is faster than two.
     const bool are_many = level.num_groups > multiprocessors,
                are_most = level.num_groups >= 6 * multiprocessors;
     const auto run_small = [&] {

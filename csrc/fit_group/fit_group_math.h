@@ -1,7 +1,7 @@
 #pragma once
 
-// Formulas of a fit, for the CPU and CUDA: the views of a group, the parameters that
-// Adam updates, and the step sizes.
+// Formulas of a fit, shared by the CPU and CUDA: the views of a group, the parameters
+// that Adam updates, and the step sizes.
 
 #include <numeric>
 
@@ -14,15 +14,17 @@
 
 namespace v3dg {
 
-// The focal length per image size in the paper's code: 88.9 px for 64 px.
+// The ratio of focal length to image size in the paper's code, which uses 88.9 px for
+// 64 px.
 constexpr double kFocalPerSize = 88.9 / 64;
-// The border around the ball, because gaussians extend beyond the ball.
+// The width of the border around the ball. It is needed because gaussians extend beyond
+// the ball.
 constexpr double kMarginPx = 2.5;
-// The number of held-out views, which no step uses. The initial values and the result
-// are compared in these views.
+// Number of held-out views. No step uses them; they are used to compare the initial
+// values with the result.
 constexpr int kHeldOutViews = 8;
 
-// Multiplies 3 x 3 matrices, row major.
+// Multiplies two 3 x 3 matrices in row-major order.
 V3DG_HD V3DG_INLINE void multiply(const double a[9], const double b[9], double out[9]) {
     for (int i = 0; i < 3; ++i)
         for (int k = 0; k < 3; ++k)
@@ -34,7 +36,7 @@ V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double
     const double a = sqrt_of(1 - u0), b = sqrt_of(u0), s = 2 * kPi * u1, t = 2 * kPi * u2;
     const double x = a * ::sin(s), y = a * ::cos(s), z = b * ::sin(t), w = b * ::cos(t);
     const double quat[4] = {w, x, y, z};
-    rotation_of_quat(quat, 2.0, r);  // 2 is exact, because the quaternion has length 1
+    rotation_of_quat(quat, 2.0, r);  // exactly 2, because the quaternion has length 1
 }
 
 // The size of a group's picture, px, if config.image_size is 0.
@@ -44,7 +46,7 @@ struct FitSize {
 
 V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGroup& group) {
     // `focal` is the focal length at which the ball's footprint (select/footprint.h)
-    // has px2_per_gaussian for each gaussian.
+    // has the area px2_per_gaussian for each gaussian.
     const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
     const double focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian /
                                  solid_angle_of_ball(x2));
@@ -53,8 +55,8 @@ V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGrou
 }
 
 // Returns view `index` of a group. The fixed views form a randomly rotated lattice on
-// the sphere. The held-out views, whose indices follow, form another lattice. Without
-// fixed views, each view is uniformly random.
+// the sphere. The held-out views have the next indices and form another lattice.
+// Without fixed views, each view has a uniformly random direction.
 V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group,
                                           uint64_t index) {
     const auto uniform = [&](uint64_t counter) {
@@ -62,8 +64,8 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     };
     double rotation[9];
     if (config.num_views > 0) {
-        // A Fibonacci lattice of directions, each with a random roll, all rotated
-        // together.
+        // A Fibonacci lattice of directions. Each direction has a random roll, and the
+        // whole lattice is rotated randomly.
         double lattice[9], turn[9];
         const auto num_fixed = static_cast<uint64_t>(config.num_views);
         const bool is_held_out = index >= num_fixed;
@@ -86,7 +88,8 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
         random_rotation(uniform(turned), uniform(turned + 1), uniform(turned + 2), turn);
         multiply(lattice, turn, rotation);
     } else {
-        // These counters must differ from the counters that shift the picture.
+        // The counters for the rotation must differ from those for the shift of the
+        // picture.
         const uint64_t base = (uint64_t(1) << 63) + 4 * index;
         random_rotation(uniform(base), uniform(base + 1), uniform(base + 2), rotation);
     }
@@ -110,9 +113,9 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     return view;
 }
 
-// Chooses the view of each visit. Fixed views are visited repeatedly. `stride` is
-// coprime to the number of fixed views, so that all of them are visited, and
-// consecutive views are far apart. Without fixed views, each visit has its own view.
+// Fixed views are visited repeatedly, in steps of `stride`. The stride is coprime to
+// the number of fixed views, so that all of them are visited, and consecutive views are
+// far apart. Without fixed views, each visit has a view of its own.
 inline uint64_t visiting_stride(const FitConfig& config) {
     const auto num_views = static_cast<uint64_t>(config.num_views);
     uint64_t stride = 29;
@@ -123,16 +126,16 @@ V3DG_HD inline uint64_t visited_view(const FitConfig& config, uint64_t stride, u
     return config.num_views > 0 ? visit * stride % static_cast<uint64_t>(config.num_views) : visit;
 }
 
-// Returns the index of a held-out view. Without fixed views, it is an index that no
-// step reaches.
+// Returns the index of a held-out view. Without fixed views, the index is beyond those
+// that steps can reach.
 V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
-// A group is compared with several pictures. First come the pictures of its fixed views
-// or, without fixed views, of the views of all steps. Then come the pictures of the
-// held-out views. The functions return the number of pictures before the held-out ones,
-// the number of all pictures, and the view of a picture.
+// The pictures of a group are numbered. First come those of its fixed views or, without
+// fixed views, of the views of all steps. The pictures of the held-out views follow.
+// These functions return the number of pictures before the held-out ones, the number of
+// all pictures, and the view of a picture.
 V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
                                 : static_cast<uint64_t>(config.steps) * config.views_per_step;
@@ -180,8 +183,10 @@ V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
             .near_depth = 1e-3f};
 }
 
-constexpr float kLeastScale = 1e-5f;  // relative to the radius; far below a pixel
-// Keeps the logit finite, and its gradient above 0.
+constexpr float kLeastScale = 1e-5f;  // relative to the radius; much smaller than a
+                                      // pixel
+// Distance of an opacity from 0 and 1. It keeps the logit finite, and its gradient
+// above 0.
 constexpr float kLeastOpacity = 1e-4f;
 constexpr float kLog2e = 1.4426950408889634f;
 
@@ -191,23 +196,23 @@ V3DG_HD V3DG_INLINE float logit_of_opacity(float opacity) {
     return ::logf(o / (1 - o));
 }
 
-// Clamps a coordinate of a mean to the box around the ball. A mean outside of all
-// pictures would have no gradient, and never come back.
+// Clamps a coordinate of a mean to the box around the ball. A mean outside all pictures
+// would have no gradient, so it would never return.
 template <class V>
 V3DG_HD V3DG_INLINE V held_in_box(V x) {
     return min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-1.0f), x));
 }
 
-// Converts a log scale to a scale, between a tiny positive value and 1, the ball's
-// radius. No gaussian of the target is larger than the ball. Extreme values could not
-// recover.
+// Converts a log scale to a scale between a tiny positive value and 1, the ball's
+// radius. Gaussians of the target are never larger than the ball. A fit could not
+// correct extreme values.
 template <class V>
 V3DG_HD V3DG_INLINE V scale_of_log(V x) {
     return exp2_in_range(min_of(all_lanes<V>(0.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
 }
-// Converts a logit to an opacity, which stays kLeastOpacity away from 0 and 1, because
-// gradients vanish there. The limit loses nothing, because alpha is clamped to 0.999
-// anyway.
+// Converts a logit to an opacity. The opacity stays kLeastOpacity away from 0 and 1,
+// where gradients vanish. The upper limit loses nothing, because alpha is clamped to
+// 0.999 anyway.
 template <class V>
 V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
     constexpr float kMost = 13.287568f;  // log2(1 / kLeastOpacity - 1)
@@ -217,7 +222,7 @@ V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
 
 // The step sizes of one step of Adam.
 struct FitStep {
-    // position: in the units of FitConfig
+    // the step of positions is in the units of FitConfig
     float position, quat, log_scale, logit, sh0, sh_rest;
     float correction1, correction2;
 };
@@ -241,20 +246,21 @@ V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& grou
     return config.position_in_world ? step.position / group.radius : step.position;
 }
 
-// The loss of a cell is quadratic in smaller mean differences, so that rounding does
-// not decide the sign of its slope.
+// For mean differences below this value, the loss of a cell is quadratic. Otherwise
+// rounding would decide the sign of the gradient.
 constexpr float kLeastMean = 1e-4f;
 
-// Returns the slope of the loss of a cell at each of its 4 x 4 pixels. `sum` is the sum
-// of their differences, `weight` the slope of the |difference| of one pixel.
+// Returns the gradient of a cell's loss with respect to each of its 4 x 4 pixels. `sum`
+// is the sum of the pixels' differences. `weight` is the gradient of the absolute
+// difference of one pixel.
 V3DG_HD V3DG_INLINE float cell_slope(const LossWeights& loss, float sum, float weight) {
     const float relative = sum / (16 * kLeastMean);
-    // In this order the result is finite for NaN, too.
+    // The order of min_of() and max_of() gives a finite result for NaN, too.
     return loss.cells * weight * max_of(min_of(relative, 1.0f), -1.0f);
 }
 
 // Returns the loss by which the initial values and the result are compared. `error` has
-// the mean |difference| of colour and of alpha.
+// the mean absolute differences of colour and of alpha.
 V3DG_HD inline double residual_loss(const LossWeights& loss, const double error[2]) {
     return loss.l1 * error[0] + loss.alpha * error[1];
 }

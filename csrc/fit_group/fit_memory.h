@@ -1,7 +1,8 @@
 #pragma once
 
-// The locations of the arrays of a fit on the device: in the shared memory of a block,
-// or in scratch memory. The host computes them, so this header does not use CUDA.
+// The memory layout of a fit on the device. An array is either in the shared memory of
+// a block, or in scratch memory. The host computes the layout, so this header does not
+// use CUDA.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,8 +14,8 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kViewsAtOnce = 2;
-// The size of a cell, which a half-warp blends, and of a region, px. A CellMask has one
-// bit per cell of a region. Larger pictures have several regions.
+// The size, px, of a cell and of a region. A half-warp blends a cell, and a CellMask
+// has one bit per cell of a region. Larger pictures have several regions.
 constexpr int kCell = 4, kCellPixels = kCell * kCell;
 constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
 static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16,
@@ -24,9 +25,9 @@ constexpr int kAtOnce = 4;  // gaussians that a half-warp blends together
 constexpr int kSums = 9;    // values per slot: FalloffSums and colour
 constexpr int kSumStride = 12;
 
-// The shape that a kernel is compiled for: the number of threads; whether groups are
-// small, so that frequently read arrays are in shared memory; and the number of
-// gaussians that a warp processes between two sums over pixels (chunk).
+// The shape of a kernel, fixed at compile time. It consists of the number of threads,
+// whether groups are small (frequently read arrays are then in shared memory), and the
+// chunk: the number of gaussians that a warp processes between two sums over pixels.
 template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
 struct FitShape {
     static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;
@@ -35,33 +36,35 @@ struct FitShape {
     using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;
 };
 
-// The location of an array: in the block's shared memory, or in the team's scratch
-// memory.
+// The location of an array, either in the block's shared memory or in the team's
+// scratch memory.
 struct Place {
     size_t offset;
     bool is_shared;
 };
 
 struct FitLayout {
-    // Arrays in shared memory for small groups, and in scratch memory for large groups.
+    // Arrays that are in shared memory for small groups, and in scratch memory for
+    // large groups.
     size_t records, sorted, keys, mask, slot_first, order, lists, errors;
     size_t list_size;          // bytes of a half-warp's list
-    size_t fragments, staged;  // in shared memory
-    // Arrays in shared memory if there is room, and otherwise in scratch memory.
+    size_t fragments, staged;  // always in shared memory
+    // Arrays that are in shared memory if there is room, and otherwise in scratch
+    // memory.
     Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
-    size_t far_slots, maps, exchange;  // in scratch memory
+    size_t far_slots, maps, exchange;  // always in scratch memory
     uint32_t num_near_slots, num_far_slots;
     size_t shared_bytes;   // bytes per block
     size_t scratch_bytes;  // bytes per team
 };
 
-// Returns the bytes of a warp's fragments: two floats per gaussian and pixel, in rows
-// of 33, then four floats per pixel.
+// Returns the number of bytes of a warp's fragments. There are two floats per gaussian
+// and pixel, in rows of 33, and then four floats per pixel.
 V3DG_HD constexpr size_t fragments_bytes(int chunk) {
     return (chunk * 33 * 2 + 32 * 4) * sizeof(float);
 }
 
-// Assigns memory to arrays, in shared memory and in scratch memory.
+// Allocates arrays in shared memory and in scratch memory.
 struct Arena {
     bool is_small;
     size_t shared_limit, shared = 0, scratch = 0;  // bytes
@@ -75,11 +78,10 @@ struct Arena {
         scratch += rounded(bytes);
         return scratch - rounded(bytes);
     }
-    // Returns memory that is in shared memory for a small group, and in scratch memory
-    // for a large group.
+    // Allocates shared memory for a small group, and scratch memory for a large group.
     size_t hot(size_t bytes) { return is_small ? in_shared(bytes) : in_scratch(bytes); }
-    // Returns memory that is in shared memory for a small group if there is room, and
-    // otherwise in scratch memory.
+    // Allocates shared memory for a small group if there is room, and otherwise scratch
+    // memory.
     Place anywhere(size_t bytes) {
         const bool fits = is_small && shared + rounded(bytes) <= shared_limit;
         return {fits ? in_shared(bytes) : in_scratch(bytes), fits};
@@ -88,14 +90,14 @@ struct Arena {
 
 // The sizes that determine a layout.
 struct FitSizes {
-    size_t most_gaussians, floats_per_gaussian;  // largest values of any group
+    size_t most_gaussians, floats_per_gaussian;  // maxima over all groups
     int largest_picture;                         // side, px
     bool has_dssim;
     size_t num_blocks;    // blocks that fit a group together
     size_t shared_limit;  // bytes per block
 };
 
-// Returns the layout. Fields that a small, or a large, group does not use are 0.
+// Returns the layout. Fields that a group of this size does not use are 0.
 template <class Shape>
 FitLayout layout_of(const FitSizes& sizes) {
     constexpr bool kSmall = Shape::kSmall;
@@ -114,8 +116,8 @@ FitLayout layout_of(const FitSizes& sizes) {
     if (!kSmall) l.sorted = arena.hot((places + 1) * sizeof(Record<float>));
     l.mask = arena.hot(regions * places * sizeof(CellMask));
     l.slot_first = arena.hot(regions * places * sizeof(uint32_t));
-    // A small group's keys share memory with slot_first: the keys are used only before
-    // slots are assigned.
+    // In a small group, keys share memory with slot_first, because keys are no longer
+    // needed when slots are assigned.
     l.keys = kSmall ? l.slot_first : arena.hot(places * sizeof(uint32_t));
     l.order = arena.hot(places * kIndex);
     l.list_size = Arena::rounded((padded + kAtOnce) * kIndex);
@@ -125,8 +127,8 @@ FitLayout layout_of(const FitSizes& sizes) {
     l.errors = kSmall && errors_bytes <= kFragments ? l.fragments : arena.hot(errors_bytes);
     if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
     // Gradients and sort keys share memory with the fragments and, in small groups,
-    // with the lists. The lists and the fragments are never in use together with
-    // gradients or keys.
+    // with the lists. Gradients and keys are never in use at the same time as lists or
+    // fragments.
     const size_t over = kSmall ? l.lists : l.fragments;
     const auto over_fragments = [&](size_t bytes) {
         return num_blocks == 1 && bytes <= l.fragments + kFragments - over ? Place{over, true}
@@ -154,7 +156,7 @@ FitLayout layout_of(const FitSizes& sizes) {
     if (sizes.has_dssim)
         l.maps = arena.in_scratch(10 * 3 * kViewsAtOnce * largest * largest * kFloat);
     if (kSmall && arena.shared < sizes.shared_limit) {
-        // Slots use the rest of the shared memory.
+        // Slots use the remaining shared memory.
         l.num_near_slots =
             static_cast<uint32_t>((sizes.shared_limit - arena.shared) / (kSums * kFloat));
         l.near_slots = {arena.in_shared(l.num_near_slots * kSums * kFloat), true};

@@ -1,4 +1,5 @@
-// Functions of fit_group.h about views, for callers that do not include the formulas.
+// Functions of fit_group.h about views, in a file of their own, so that callers do not
+// include the formulas.
 
 #include <stdexcept>
 #include <string>

@@ -1,6 +1,6 @@
 #pragma once
 
-// Draws the picture of a group on the CPU: sorts its gaussians by depth, and blends
+// Draws the picture of a group on the CPU. It sorts the gaussians by depth, and blends
 // them over the tiles of a square.
 
 #include "fit_group/fit_group.h"
@@ -38,7 +38,7 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
     return g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize;
 }
 
-// Blends records in the order of `order`.
+// Blends records in the sequence given by `order`.
 static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_t count, int left,
                          int top, int size, TilePlanes<float>& tile) {
     blend_tile<float, Extra::kNothing>(

@@ -1,7 +1,8 @@
 #pragma once
 
 // The parameters of a group on CUDA, and their updates. Means, quaternions, log scales
-// and logits have one plane each. The SH coefficients follow, gaussian by gaussian.
+// and logits are stored in one plane per component. The SH coefficients follow,
+// gaussian by gaussian.
 
 #include <cfloat>
 
@@ -43,8 +44,8 @@ __device__ void start_parameters(const Fit& fit) {
     for (uint32_t k = fit.first(); k < fit.num_values; k += fit.stride()) m[k] = v[k] = 0;
 }
 
-// Writes the parameters to the rows, in world units. If any is not finite, it writes
-// nothing and returns false.
+// Writes the parameters to the rows, in world units. If any parameter is not finite,
+// writes nothing and returns false.
 template <class Fit>
 __device__ bool write_parameters(const Fit& fit) {
     const float* value = fit.at(fit.layout.value);
@@ -72,7 +73,7 @@ __device__ bool write_parameters(const Fit& fit) {
 }
 
 // Adds the gradients of a batch of views to the gradients of the step. After the last
-// batch, it performs the step of Adam.
+// batch, performs the step of Adam.
 template <class Fit>
 __device__ void move_parameters(const Fit& fit, const FitStep& step, int num_views, int turn,
                                 bool is_first, bool is_last) {

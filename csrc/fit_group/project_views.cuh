@@ -1,7 +1,8 @@
 #pragma once
 
-// Projects the gaussians of a group into the views of a batch, one thread per gaussian
-// and view. Computes the gradients of parameters from the gradients of records.
+// Projects the gaussians of a group into the views of a batch, with one thread per
+// gaussian and view. Also computes the gradients of parameters from the gradients of
+// records.
 
 #include <type_traits>
 

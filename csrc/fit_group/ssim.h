@@ -8,12 +8,12 @@
 
 namespace v3dg {
 
-// Two pictures with interleaved channels. T is float or double; all computation is in
-// double.
+// Two pictures with interleaved channels. T is float or double; sums are always
+// computed in double.
 template <class T>
 struct SsimInput {
     const T *picture, *target;  // [height * width * channels]
-    size_t height, width;       // both larger than kSsimRadius
+    size_t height, width;       // both must be larger than kSsimRadius
     size_t channels;
 };
 

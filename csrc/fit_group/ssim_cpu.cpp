@@ -28,7 +28,7 @@ void add(SsimSums<double>& to, double weight, const SsimSums<double>& s) {
 template <class T>
 double sum_of_row(const SsimInput<T>& in, size_t row) {
     const size_t row_size = in.width * in.channels;
-    // Sums over the rows of the window, one per column.
+    // Sums over the rows of the window, one per column of the picture.
     std::vector<SsimSums<double>> columns(row_size);
     for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
         const size_t first = mirrored(row, k, in.height) * row_size;

@@ -1,7 +1,7 @@
 #pragma once
 
-// The gaussians of a group while the CPU fits them: parameters, gradients, and steps of
-// Adam.
+// The gaussians of a group while they are fitted on the CPU: parameters, gradients, and
+// steps of Adam.
 
 #include <algorithm>
 #include <cmath>
@@ -13,9 +13,9 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// The fitted gaussians of one group. The parameters are a single array: means,
-// quaternions, log scales, logits, SH coefficients. The gradient and the two moments
-// have the same layout.
+// The fitted gaussians of one group. A single array holds all parameters: means,
+// quaternions, log scales, logits and SH coefficients, in this order. The gradient and
+// the two moments have the same layout.
 class Student {
   public:
     Student(const FitConfig& config, const FitGroup& group, const GaussianRows<float>& rows)
@@ -113,8 +113,8 @@ class Student {
         activate();
     }
 
-    // Writes the parameters to the rows, in world units. If any is not finite, it
-    // writes nothing and returns false.
+    // Writes the parameters to the rows, in world units. If any parameter is not
+    // finite, writes nothing and returns false.
     bool write(const GaussianRows<float>& rows) const {
         for (size_t i = 0; i < n_ * (11 + num_sh_); ++i)
             if (!std::isfinite(value_[i])) return false;

@@ -2,10 +2,10 @@
 
 // The blocks that fit a group together, and their memory.
 //
-// Small groups keep frequently read arrays in shared memory. One block fits a small
-// group. If there are few groups, two blocks fit it, each with every other view. Large
-// groups are in global memory. If there are fewer of them than multiprocessors, a team
-// of blocks fits each.
+// Small groups keep frequently read arrays in shared memory. Usually, one block fits a
+// small group; if there are few groups, two blocks fit it, each of them half of the
+// views. The arrays of large groups are in global memory. If there are fewer large
+// groups than multiprocessors, a team of blocks fits each of them.
 
 #include "base/launch.cuh"
 #include "fit_group/fit_group_math.h"
@@ -26,21 +26,22 @@ struct FitCameras {
 
 constexpr int kBetweenGroups = 2;
 
-// The variables that the blocks of a group share. Their arrays are in FitLayout.
+// Variables that the blocks of a group share. FitLayout has the locations of their
+// arrays.
 struct FitTeam {
     unsigned arrived;  // number of arrivals at barriers
     unsigned unit, ticket;
     // Copies of FitSignals::cancel. Steps use the first elements in turn, so that one
-    // is read while the next is written. The last element is used between groups.
+    // can be read while the next is written. The last element is used between groups.
     int cancel[kBetweenGroups + 1];
     uint32_t num_slots[kLargestTeam];  // number of slots in each block's part
-    // [view][initial values, result][colour, alpha] errors of the block's views.
+    // [view][initial values, result][colour, alpha] errors in the block's views.
     double error[kViewsAtOnce][2][2];
 };
 
-// The variables of a block in shared memory. Its arrays are in FitLayout.
+// Variables of a block in shared memory. FitLayout has the locations of its arrays.
 struct FitShared {
-    FitCameras cameras[2];  // for this batch of views, and for the next
+    FitCameras cameras[2];  // for the current batch of views, and for the next
     FitTeam own;            // used if the team is a single block
     uint32_t warp_total[32];
     FitJob job;
@@ -48,8 +49,8 @@ struct FitShared {
     int cancel;
 };
 
-// A block that fits groups, one after another: its rank among the blocks of its group,
-// the barriers between them, and where their arrays are.
+// A block that fits groups, one after another. It has the block's rank among the blocks
+// of its group, the barriers between them, and the locations of their arrays.
 template <class Shape>
 struct FitBlock : Shape {
     using Shape::kChunk, Shape::kSmall, Shape::kThreads, Shape::kWarps;
@@ -58,15 +59,17 @@ struct FitBlock : Shape {
     const FitGroupsInput& in;
     const FitLayout& layout;
     FitShared& s;
-    // All blocks of the group. In a small group, the blocks divide the views.
+    // Shared by all blocks of the group. In a small group, the blocks divide the views.
     FitTeam& all;
-    // The blocks that process the same views. In a small group, each block is a team.
+    // Shared by the blocks that process the same views. In a small group, each block is
+    // a team of its own.
     FitTeam& team;
     const unsigned team_rank, team_size;
-    // The block's views of a batch: view_rank, view_rank + view_stride, ...
+    // Of a batch, the block processes the views view_rank, view_rank + view_stride, and
+    // so on.
     const unsigned view_rank, view_stride;
     unsigned char* const scratch;
-    // The gradients per view, for small groups with several blocks.
+    // Gradients per view, for small groups that are fitted by several blocks.
     unsigned char* const exchange;
     unsigned char* const hot;
     // The current group.
@@ -104,7 +107,7 @@ struct FitBlock : Shape {
 
     __device__ bool leads() const { return threadIdx.x == 0 && team_rank == 0; }
     __device__ bool leads_all() const { return leads() && view_rank == 0; }
-    // Returns the thread's index in the team. Consecutive warps are in different
+    // Returns the thread's index in the team. Consecutive warps belong to different
     // blocks.
     __device__ uint32_t first() const {
         return (threadIdx.x / 32 * team_size + team_rank) * 32 + threadIdx.x % 32;
@@ -121,9 +124,9 @@ struct FitBlock : Shape {
             __syncthreads();
     }
 
-    // Waits for all blocks of the group. Afterwards s.cancel is equal in all of them:
-    // the value that read_cancel() wrote to `note`. This element must not be
-    // overwritten before all blocks have reached another barrier.
+    // Waits for all blocks of the group. Afterwards, s.cancel is the same in all of
+    // them: the value that read_cancel() wrote to element `note`. This element must not
+    // be overwritten before all blocks have reached another barrier.
     __device__ void sync_all(int note) const {
         if (num_blocks() > 1)
             arrive_and_wait(note);
@@ -158,8 +161,8 @@ struct FitBlock : Shape {
     }
     // A place is the index of a gaussian in a view; the places of view b begin at b *
     // n_padded. A rank is the index of a record for blending. In a small group, ranks
-    // are places, and lists are in the sequence of `order`. In a large group, records
-    // are sorted, and ranks are positions in the sorted sequence.
+    // are places, and `order` gives the sequence of the lists. In a large group,
+    // records are sorted, and ranks are positions in the sorted sequence.
     __device__ Record<float>* records() const { return hot_at<Record<float>>(layout.records); }
     __device__ Record<float>* ranked() const {
         return hot_at<Record<float>>(kSmall ? layout.records : layout.sorted);
@@ -179,9 +182,9 @@ struct FitBlock : Shape {
     __device__ Index* list(int half) const {
         return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
-    // Returns the fragments of a warp, [gaussian][pixel]: the gradient with respect to
-    // the exponent, and the weight. Rows have an extra column, so that lanes that read
-    // the same pixel of different gaussians access different banks.
+    // Returns the fragments of a warp, [gaussian][pixel]. A fragment has the gradient
+    // with respect to the exponent, and the weight. Rows have an extra column, so that
+    // lanes that read the same pixel of different gaussians access different banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
                                          threadIdx.x / 32 * fragments_bytes(kChunk));
@@ -189,16 +192,16 @@ struct FitBlock : Shape {
     __device__ float4* d_pixels() const {
         return reinterpret_cast<float4*>(fragments() + kChunk * 33);
     }
-    // Returns the records of the current chunk of each half-warp, for a large group.
+    // Returns the records of the current chunk of each half-warp. Only for large
+    // groups.
     __device__ Record<float>* staged() const {
         return reinterpret_cast<Record<float>*>(shared_memory() + layout.staged) +
                2 * kChunk * (threadIdx.x / 32);
     }
     __device__ int num_regions() const { return regions_across * regions_across; }
-    // Returns the gradients of the parameters in view b of a batch. If several blocks
-    // divide the views, one block may write the gradients of a batch while another
-    // still reads those of the previous batch; so `turn` alternates between two
-    // buffers.
+    // Returns the gradients of the parameters in view b of a batch. `turn` alternates
+    // between two buffers: if several blocks divide the views, one block may write the
+    // gradients of a batch while another still reads those of the previous batch.
     __device__ float* gradient(int turn, int b) const {
         if (view_stride == 1) return at(layout.by_view) + static_cast<size_t>(b) * num_values;
         return reinterpret_cast<float*>(exchange) +

@@ -1,6 +1,6 @@
-// Views of random cuts of a bundle. The number of a view determines a size, a camera,
-// and a window in which cuts are compared. The shares of gaussians in its cuts depend
-// on the size.
+// Chooses views of random cuts of a bundle. The index of a view determines a size, a
+// camera, and a window in which cuts are compared. The shares of gaussians in its cuts
+// depend on the size.
 
 #include "levels/cut_views.h"
 
@@ -17,20 +17,23 @@ namespace v3dg {
 
 namespace {
 
-constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of a picture's side, px
+constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of the width and height
+                                                       // of a picture, px
 // The px² per gaussian at the native size of a cut. At this size, the default tolerance
 // selects the cut.
 constexpr double kNativePx2 = 2;
-// The range of a picture's side, relative to the native size of its cut.
+// The range of a picture's size, relative to the native size of its cut: the smallest
+// value, and the number of octaves.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
 constexpr double kDistance = 2.5;  // distance of the camera from the centre, in radii
 constexpr double kNear = 0.01;     // near depth, in radii
-constexpr int kMostTries = 16;     // attempts to find a gaussian that is in the picture
+constexpr int kMostTries = 16;     // number of attempts to find a gaussian inside the
+                                   // picture
 constexpr int kMostTriesOfShare = 64;
-// An upper bound on the random numbers that one view, or one of its shares, uses.
+// An upper bound on how many random numbers one view, or one of its shares, needs.
 constexpr uint64_t kRandomNumbersOfView = 1024;
 constexpr double kMostOfAsset = 0.7;  // largest share of the asset's gaussians in a cut
-// The share of gaussians that CutPictures::ball contains. The ball ignores outliers.
+// Fraction of the gaussians that CutPictures::ball contains. The ball ignores outliers.
 constexpr double kShare = 0.99;
 
 // The random numbers of one view.
@@ -52,7 +55,7 @@ class Random {
 };
 
 // Returns a camera that looks at the centre of the ball from a random direction. Its
-// picture is one pixel large.
+// picture is a single pixel.
 Camera camera_around(const CutPictures& pictures, Random& random) {
     double outwards[3], up[3], right[3];
     random.direction(outwards);
@@ -74,7 +77,7 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
                       .near_depth = kNear * pictures.ball.radius});
 }
 
-// Returns the camera with the size of its picture scaled, and extended to whole pixels.
+// Returns the camera with a scaled picture whose size is rounded up to whole pixels.
 Camera resized(const Camera& camera, double scale) {
     const Camera scaled = camera.scaled(scale);
     const double width = std::ceil(scaled.width);
@@ -94,7 +97,7 @@ Camera on_screen(const Camera& camera, Random& random) {
 }
 
 // Returns a window of the picture around a random gaussian. CutPictures::weight holds
-// the prefix sums of the probabilities.
+// the prefix sums of the gaussians' probabilities.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
                  Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
@@ -125,7 +128,7 @@ Camera window_of(const Camera& camera, double widest_px, const CutPictures& pict
     return camera.cropped(left, top, width, height);
 }
 
-// The tables of a scene with a single instance of a bundle, without transformation.
+// The tables of a scene that has a single, untransformed instance of a bundle.
 struct OneInstance {
     const int32_t bundle = 0;
     const double position[3] = {}, quaternion[4] = {1, 0, 0, 0}, scale = 1;
@@ -167,9 +170,9 @@ double share_of_part(const CutPictures& pictures, double part) {
     return pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
 }
 
-// Returns the share of gaussians in cut `cut` of a view. Later cuts have the same
-// distribution of shares as first cuts, limited to shares for which the size of the
-// picture is allowed.
+// Returns the share of gaussians in cut `cut` of a view. First and later cuts have the
+// same distribution of shares, except that later cuts are limited to shares for which
+// the size of the picture is allowed.
 double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t number,
                     size_t cut) {
     if (cut == 0) return view.share;
@@ -183,9 +186,8 @@ double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t
 }
 
 // The parameters of a comparison: the largest side of the window, and the samples per
-// pixel side of the asset's picture. The larger gaussians appear, the smoother a
-// picture is, and the fewer samples it needs. `size` is relative to the asset's native
-// size.
+// pixel side of the asset's picture. Large gaussians make a picture smooth, so it needs
+// fewer samples. `size` is relative to the asset's native size.
 struct Comparison {
     double widest_px;
     int samples;
@@ -258,8 +260,8 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
     pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
-    // Weight gaussians by their size on screen, approximately: the mean of the two
-    // larger scales, times the opacity.
+    // Weight gaussians by their approximate size on screen: the mean of the two larger
+    // scales, times the opacity.
     double sum = 0;
     for (size_t i = 0; i < asset.size; ++i) {
         double scale[3];
@@ -315,9 +317,10 @@ std::vector<SelectRule> cuts_of_view(const CutPictures& pictures, const AssetVie
     for (size_t cut = 0; cut < count; ++cut) {
         SelectRule rule = whole;
         BudgetCut found = cuts[cut];
-        // If the camera is inside of a group's ball, the group is refined at any
+        // If the camera is inside a group's ball, the group is refined at any
         // tolerance. Then only the coarsest cut may meet the budget, with far fewer
-        // gaussians than allowed. In this case, exclude the finest levels instead.
+        // gaussians than allowed. In this case, exclude the finest levels until a cut
+        // has a finite tolerance.
         while (std::isinf(found.tolerance_px2) &&
                2 * found.num_gaussians < static_cast<int64_t>(budgets[cut]) &&
                rule.min_level < coarsest) {

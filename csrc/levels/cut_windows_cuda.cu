@@ -1,6 +1,6 @@
-// The cuts of windows on CUDA. A block processes one window, and all clusters of the
-// table. The file is compiled without floating-point contraction, so that a window has
-// the same clusters as on the CPU.
+// Computes the cuts of windows on CUDA. A block processes one window and all clusters
+// of the table. The file is compiled without floating-point contraction, so that the
+// clusters are the same as on the CPU.
 
 #include "levels/cut_windows_cuda.h"
 
@@ -51,7 +51,7 @@ __global__ void __launch_bounds__(kCutThreads)
     if (threadIdx.x == 0) num_items[w] = done;
 }
 
-// One thread per cluster, one row of blocks per window.
+// Launched with one thread per cluster, and one row of blocks per window.
 __global__ void __launch_bounds__(kItemThreads)
     window_items_kernel(ClusterTable table, uint32_t num_windows, const int32_t* item_of_cluster,
                         const uint32_t* num_items, Appearance<float> appearance, ItemList items) {
@@ -89,7 +89,7 @@ __global__ void __launch_bounds__(kItemThreads)
 }  // namespace
 
 DeviceTable::DeviceTable(const ClusterTable& table, cudaStream_t stream) : table_(table) {
-    // The kernels do not read these tables.
+    // Clear these tables, because the kernels do not read them.
     table_.top_group = {};
     table_.top_cluster = {};
     table_.pages = {};

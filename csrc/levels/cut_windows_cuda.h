@@ -1,6 +1,7 @@
 #pragma once
 
-// The cuts of several windows at once, on CUDA, as the items of one frame.
+// Computes the cuts of several windows at once, on CUDA. Their clusters become the
+// items of one frame.
 
 #include "draw/frame_cuda.h"
 #include "levels/cut_views.h"
@@ -13,7 +14,7 @@ namespace cuda {
 // The tables of a bundle that a cut reads, in device memory.
 class DeviceTable {
   public:
-    // The caller may reuse host memory on return.
+    // Copies the table before it returns.
     DeviceTable(const ClusterTable& table, cudaStream_t stream);
     const ClusterTable& table() const { return table_; }
 
@@ -22,7 +23,7 @@ class DeviceTable {
     ClusterTable table_;
 };
 
-// The clusters that windows show.
+// Which clusters the windows show.
 enum class Shown {
     cuts,    // the clusters of the windows' cuts
     leaves,  // the clusters of level 0
@@ -39,8 +40,8 @@ struct WindowTables {
     PictureGradient<float> slope[kMostWindows];
 };
 
-// Returns the colour and alpha planes of a window. `memory` has room for `most_pixels`
-// pixels per window, four floats each.
+// Returns the colour and alpha planes of a window. `memory` must have room for
+// `most_pixels` pixels per window, with four floats each.
 V3DG_HD inline PicturePlanes planes_of_window(float* memory, size_t most_pixels, size_t window) {
     float* color = memory + 4 * most_pixels * window;
     return {color, color + 3 * most_pixels, nullptr, false};
@@ -50,22 +51,22 @@ V3DG_HD inline PicturePlanes planes_of_window(float* memory, size_t most_pixels,
 // has n / kItemSize items, rounded up. C is the number of clusters.
 class DeviceWindows {
   public:
-    // Copies the tables to the device, and computes the cuts of all windows. The caller
-    // may reuse host memory on return.
+    // Computes the cuts of all windows on the device. Copies the tables before it
+    // returns.
     void cut(const DeviceTable& table, const WindowTables& windows, Shown shown,
              cudaStream_t stream);
 
     uint32_t count() const { return count_; }
     uint32_t num_tiles() const { return num_tiles_; }
     const WindowTables* tables() const { return tables_.data(); }
-    // [count * C] index of the first item of each cluster within its window; -1 if the
-    // window does not show the cluster
+    // [count * C] for each window and cluster, the index of the cluster's first item
+    // within the window; -1 if the window does not show the cluster
     const int32_t* item_of_cluster() const { return item_of_cluster_.data(); }
     // [count] number of items of each window
     const uint32_t* num_items() const { return num_items_.data(); }
 
-    // Enqueues writing the items of all windows, window by window. The records of item
-    // i begin at kItemSize * i.
+    // Enqueues the writing of the items of all windows, one window after another. The
+    // records of item i begin at kItemSize * i.
     void write_items(const DeviceTable& table, const Appearance<float>& appearance,
                      const ItemList& items, cudaStream_t stream) const;
 

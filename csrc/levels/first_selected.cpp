@@ -1,5 +1,5 @@
-// Compares pictures of the leaves and of level 1 at several sizes. The growth of a
-// group's ball minimises a sum, over sizes, of the logarithms of the ratios of losses.
+// Compares pictures of the leaves and of level 1 at several sizes. The size with the
+// smallest sum of log loss ratios determines the growth of a group's ball.
 
 #include "levels/first_selected.h"
 
@@ -15,27 +15,26 @@ namespace v3dg {
 
 namespace {
 
-// Limits of the growth of balls. At the default tolerance of kDefaultPx2, they
-// correspond to 1.5 and 0.19 px² per gaussian.
+// Limits of the growth of balls. At the default tolerance, kDefaultPx2, they correspond
+// to 1.5 and 0.19 px² per gaussian.
 constexpr double kLeast = 1.4, kMost = 4, kDefaultPx2 = 3;
-// Median px² per gaussian.
+// Median px² per gaussian at each size.
 constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2, 3};
 constexpr double kWidestPx = 2048;  // largest width of a picture
 constexpr double kBorderPx = 4;     // border around the ball
 constexpr double kDistance = 8;     // distance of the camera from the centre, in radii
-constexpr double kShare = 0.999;    // share of the gaussians in the ball
+constexpr double kShare = 0.999;    // fraction of the gaussians in the ball
 // The loss of a pixel is its absolute error to the power of kPower, which approximates
-// perception. A level looks as good as its leaves if its loss is at most kAsGood times
-// the loss of the leaves. This agrees with FLIP.
+// perception. A level counts as good enough if its loss is at most kAsGood times the
+// loss of the leaves. This criterion agrees with FLIP.
 constexpr float kPower = 0.7f;
 constexpr double kAsGood = 1.15;
 // Corrections for groups that are hardly visible. kLikeAll times the mean loss of all
-// groups is added to both losses, so that such a group is treated like the average.
-// kOutOfSight times the mean is added to the loss of the leaves, because errors of
+// groups is added to both losses, so that such a group is treated like an average one.
+// kOutOfSight times the mean is added to the loss of the leaves only, because errors of
 // hardly visible groups matter less.
 constexpr double kLikeAll = 0.2, kOutOfSight = 0.05;
-// Losses are increased by kNothing, and footprints are at least kNothing, so that
-// ratios are finite.
+// Added to losses, and minimum of footprints, to keep ratios finite.
 constexpr double kNothing = 1e-9;
 constexpr int kSteps = 64;  // number of sizes to try
 
@@ -62,8 +61,8 @@ FirstSelected::FirstSelected(Span<const float> means, Span<const Ball> balls,
     }
 }
 
-// Cameras are evenly distributed around the ball. Each picture is shifted by a
-// different fraction of a pixel.
+// Cameras are evenly distributed around the ball. Each picture is shifted by another
+// fraction of a pixel.
 Camera FirstSelected::camera(size_t picture) const {
     const size_t side = picture % kSides;
     const double z = 1 - (2 * static_cast<double>(side) + 1) / kSides;
@@ -71,7 +70,7 @@ Camera FirstSelected::camera(size_t picture) const {
     const double flat = std::sqrt(1 - z * z);
     const double outwards[3] = {flat * std::cos(angle), flat * std::sin(angle), z};
     double up[3] = {0, 0, 1}, right[3];
-    cross3(up, outwards, right);  // not parallel: no camera is straight above
+    cross3(up, outwards, right);  // never parallel, because no camera is straight above
     for (double& x : right) x /= flat;
     const double focal = focal_[picture / kSides];
     const double size =
@@ -106,7 +105,8 @@ std::vector<float> FirstSelected::growth() const {
     std::vector<float> growth;
     for (size_t g = 0; g < footprint_.size(); ++g) {
         double log_px2_of[kSizes];
-        double log_ratio[kSizes];  // log of (loss of level 1 / largest acceptable loss)
+        double log_ratio[kSizes];  // log of the loss of level 1 over the largest
+                                   // acceptable loss
         for (size_t size = 0; size < kSizes; ++size) {
             log_px2_of[size] = std::log(footprint_[g] * focal_[size] * focal_[size]);
             const double of_level = of_level_[size][g] + kLikeAll * mean_of_level[size] + kNothing;
@@ -114,8 +114,8 @@ std::vector<float> FirstSelected::growth() const {
                 of_leaves_[size][g] + (kLikeAll + kOutOfSight) * mean_of_leaves[size] + kNothing;
             log_ratio[size] = std::log(of_level / of_leaves / kAsGood);
         }
-        // Begin at the smallest size, and choose the size up to which the sum is
-        // smallest.
+        // Begin at the smallest size, and choose the size up to which the sum of log
+        // ratios is smallest.
         double sum = 0, least = INFINITY, first = kMost;
         for (int step = 0; step < kSteps; ++step) {
             const double times = kMost * std::pow(kLeast / kMost, step / (kSteps - 1.0));
@@ -146,7 +146,7 @@ void losses_of_pixels(const PictureColors& colors, size_t width, size_t height,
             truth[3 * (y / kSamples * width + i / (3 * kSamples)) + i % 3] +=
                 std::min(colors.truth[3 * kSamples * width * y + i], 1.0f) / (kSamples * kSamples);
     // An error in a single pixel is hardly visible, so errors are blurred over adjacent
-    // pixels. The border of a picture is empty, so wrapping around is harmless.
+    // pixels. Indices may wrap around, because the border of a picture is empty.
     const auto shared = [](const std::vector<float>& from, size_t i, size_t step) {
         const float before = i < step ? 0.0f : from[i - step];
         return 0.25f * (before + 2 * from[i] + (i + step < from.size() ? from[i + step] : 0.0f));

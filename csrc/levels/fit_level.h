@@ -7,8 +7,8 @@
 namespace v3dg {
 
 // Fits all groups of one level, each on one thread. The result does not depend on the
-// number of threads. `error` is (groups, 2). If `progress.cancel` becomes true, it
-// returns early, and some rows are not fitted.
+// number of threads. `error` is (groups, 2). If `progress.cancel` becomes true, the
+// function returns early, and leaves some rows as they were.
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress);
 

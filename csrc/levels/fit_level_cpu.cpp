@@ -1,5 +1,5 @@
-// Distributes the groups of a level over threads. fit_group/fit_group_cpu.cpp fits one
-// group.
+// Distributes the groups of a level over threads. fit_group_cpu.cpp in fit_group/ fits
+// a single group.
 
 #include "levels/fit_level.h"
 
@@ -12,16 +12,16 @@
 
 namespace v3dg {
 
-// The largest size of the target pictures in memory, bytes.
+// Maximum size, in bytes, of the target pictures in memory.
 constexpr size_t kTargetBytes = size_t(256) << 20;
 
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress) {
-    // Pictures per group.
+    // Number of target pictures per group.
     const size_t num_pictures = config.num_views > 0 ? config.num_views + kHeldOutViews : 0;
     std::vector<FitImage> images;
-    // Draw the target pictures first, in parallel over (group, view). So all threads
-    // are busy, even in the last levels with only one or two groups.
+    // Draw the target pictures first, in parallel over groups and views. So all threads
+    // are busy, even in the last levels, which have only one or two groups.
     for (size_t first = 0; first < groups.size && !progress.cancel;) {
         size_t last = groups.size;
         if (num_pictures > 0) {

@@ -1,5 +1,5 @@
-// Fits the groups of a level on CUDA, as many at once as memory has room for their
-// target pictures. Meanwhile the host reports progress and checks for cancellation.
+// Fits the groups of a level on CUDA, as many at once as there is memory for their
+// target pictures. Meanwhile, the host reports progress and checks for cancellation.
 
 #include "levels/fit_level_cuda.h"
 
@@ -17,12 +17,12 @@ namespace cuda {
 
 namespace {
 
-// The largest size of the target pictures in memory, bytes. The size is also limited to
-// a quarter of the free memory.
+// Maximum size, in bytes, of the target pictures in memory. They also use at most a
+// quarter of the free memory.
 constexpr size_t kTargetBytes = size_t(1) << 30;
 constexpr std::chrono::microseconds kBetweenLooks{50};
 
-// Memory that the host and a running kernel can both access.
+// Signals in memory that both the host and a running kernel can access.
 class Signals {
   public:
     Signals() {
@@ -36,13 +36,16 @@ class Signals {
     ~Signals() { cudaFreeHost(host_); }
 
     volatile FitSignals& host() { return *host_; }
-    FitSignals* device() const { return host_; }  // the address is equal on the device
+    FitSignals* device() const {
+        return host_;
+    }  // the host's address is also valid on
+       // the device
 
   private:
     FitSignals* host_ = nullptr;
 };
 
-// Returns the groups as jobs. The jobs that take longest come first.
+// Returns the groups as jobs, sorted by descending duration.
 std::vector<FitJob> jobs_of(const FitConfig& config, Span<const FitGroup> groups) {
     std::vector<FitJob> jobs(groups.size);
     for (size_t g = 0; g < groups.size; ++g)
@@ -61,7 +64,7 @@ size_t target_bytes(const FitConfig& config, const FitJob& job) {
     return num_pictures(config) * job.size * job.size * sizeof(float4);
 }
 
-// Fits jobs whose target pictures fit into memory together.
+// Fits the jobs whose target pictures fit into memory together.
 class LevelFit {
   public:
     LevelFit(const FitConfig& config, const DeviceFitTarget& target,
@@ -119,8 +122,8 @@ class LevelFit {
             if (progress_.cancel) signals.host().cancel = 1;
             std::this_thread::sleep_for(kBetweenLooks);
         }
-        // When two blocks finish at once, they may report their counts in the wrong
-        // order.
+        // Two blocks that finish at the same time may write their counts in the wrong
+        // order, so write the final count here.
         if (!progress_.cancel) signals.host().groups_done = jobs.size;
         report();
     }

@@ -1,4 +1,5 @@
-// Draws target pictures: thousands in one frame, larger than needed, then averaged.
+// Draws target pictures. A frame has thousands of them, larger than needed; they are
+// then averaged.
 
 #include "levels/fit_targets_cuda.h"
 
@@ -11,16 +12,17 @@ namespace cuda {
 
 namespace {
 
-// The limits on pixels and gaussians in one frame. A single picture may exceed them.
+// Limits of pixels and gaussians in one frame. A frame with a single picture may exceed
+// them.
 constexpr uint64_t kPixelsAtOnce = uint64_t(1) << 24, kGaussiansAtOnce = uint64_t(1) << 22;
 constexpr unsigned kThreads = 128;
 
-// A picture in a frame, and where its items, records and tiles begin.
+// A picture in a frame, and the indices of its first item, record and tile.
 struct TargetPicture {
     uint32_t job;
     uint32_t first_item, first_record, first_tile;
     uint64_t picture;      // index among the pictures of the job
-    uint64_t first_pixel;  // index in the enlarged picture
+    uint64_t first_pixel;  // index of its first pixel in the enlarged pictures
 };
 
 __global__ void views_kernel(FitConfig config, Span<const FitJob> jobs, uint64_t pictures,
@@ -43,7 +45,7 @@ struct TargetTables {
     Placement* placements;
 };
 
-// One block per picture, one thread per item.
+// Launched with one block per picture and one thread per item.
 __global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
                                 unsigned long long num_records, ItemList items) {
     if (blockIdx.x == 0 && threadIdx.x == 0) {
@@ -83,7 +85,8 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
     }
 }
 
-// Averages the enlarged pictures. One block per picture, one thread per target pixel.
+// Averages the enlarged pictures. Launched with one block per picture and one thread
+// per target pixel.
 __global__ void average_kernel(TargetTables t, float4* targets) {
     const TargetPicture& p = t.pictures[blockIdx.x];
     const FitJob& job = t.jobs[p.job];

@@ -1,7 +1,6 @@
 #pragma once
 
-// Refines all levels of a bundle together, by comparing pictures of cuts with the
-// asset.
+// Refines all levels of a bundle together by comparing pictures of cuts with the asset.
 
 #include "fit_group/fit_group.h"
 #include "levels/cut_views.h"
@@ -11,17 +10,18 @@ namespace v3dg {
 // The gaussians of all levels of a bundle.
 struct CutRows {
     GaussianRows<float> rows;
-    // The length that steps of each gaussian's position are relative to. A gaussian with
-    // radius 0 does not move.
+    // For each gaussian, the length that steps of its position are relative to. A
+    // gaussian with radius 0 does not move.
     Span<const float> radius;
 };
 
 // The settings of the comparison of pictures in a refinement.
 struct CutComparison {
-    // The number of windows whose gradients are added up for one step: 1 to
+    // Number of windows whose gradients are added up in one step, from 1 to
     // kMostWindows.
     int windows_per_step;
-    int cuts_per_view;  // cuts that are compared with each picture of the target
+    int cuts_per_view;  // number of cuts that each picture of the target is compared
+                        // with
     // Weight of the absolute mean difference of a window, relative to LossWeights::l1
     // and LossWeights::alpha.
     float window_means;
@@ -29,38 +29,41 @@ struct CutComparison {
 constexpr int kMostWindows = 32;
 
 // Moves gaussians so that pictures of cuts match pictures of the target. There are
-// config.steps steps of Adam. Each moves the gaussians that the step's windows show
-// (cut_views.h). The first `target_count` gaussians are level 0; they belong to the
-// target and do not move.
+// config.steps steps of Adam. Each step moves the gaussians that its windows
+// (cut_views.h) show. The first `target_count` gaussians are level 0; they belong to
+// the target and do not move.
 //
-// A fit (fit_level.h) sees each group alone, from all sides, at one size. A refinement
-// sees groups in cuts: at several sizes, beside groups of several levels, and partly
-// hidden.
+// A fit (fit_level.h) shows each group alone, from all directions, at one size. A
+// refinement shows groups in cuts: at several sizes, next to groups of several levels,
+// and partly hidden.
 //
-// All levels are drawn with the filter of `config`. This includes level 0, although it
-// is drawn without a filter elsewhere; in small pictures, aliasing is a third of the
-// error of cuts. Pictures of the target are drawn larger and averaged. The loss is the
-// loss of a fit without D-SSIM, and of the mean differences of windows. Steps of
-// positions are relative to the radius. The step sizes in `config` are for a gaussian
-// that one window shows. The image sizes, supersampling and numbers of views in
-// `config` are ignored.
+// All levels are drawn with the filter of `config`, even level 0, which is drawn
+// without a filter elsewhere. Without the filter, aliasing would be a third of the
+// error of cuts in small pictures. Pictures of the target are drawn larger and
+// averaged. The loss is that of a fit without D-SSIM, plus the mean differences of
+// windows. Steps of positions are relative to the radius. The step sizes in `config`
+// apply to a gaussian that one window shows. The image sizes, supersampling and numbers
+// of views in `config` are ignored.
 //
 // The result does not depend on the number of threads. If `progress.cancel` becomes
-// true, it returns early. `progress.groups_done` counts windows.
+// true, the function returns early. `progress.groups_done` counts windows.
 void refine_cuts(const FitConfig& config, const CutComparison& comparison, const FitTarget& target,
                  uint64_t target_count, const CutRows& levels, const CutPictures& pictures,
                  FitProgress& progress);
 
-// The visibility of each gaussian in windows.
+// How much of each gaussian the windows show.
 struct SeenOfGaussians {
-    // Sum of blend weights, as a fraction of each picture's pixels.
+    // For each gaussian, its blend weights as a fraction of each picture's pixels,
+    // summed over pictures.
     Span<double> weight;
-    // Number of windows whose cuts contain the gaussian, visible or not.
+    // For each gaussian, the number of windows whose cuts contain it, whether it is
+    // visible or not.
     Span<int32_t> num_looks;
 };
 
-// Draws the window of the first cut of each of config.steps views like refine_cuts(),
-// and adds to `seen` how much the windows show of each gaussian.
+// Measures how visible gaussians are. Draws the window of the first cut of each of
+// config.steps views, as refine_cuts() does, and adds to `seen` how much of each
+// gaussian the windows show.
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
                 const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress);
 

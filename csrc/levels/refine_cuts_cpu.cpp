@@ -1,5 +1,5 @@
 // Refinement on the CPU. Windows are drawn one after another, each on all threads.
-// Views are planned some windows ahead, in parallel.
+// Views are planned in parallel, some windows ahead.
 
 #include "levels/refine_cuts.h"
 
@@ -20,7 +20,7 @@ constexpr size_t kGaussiansAtOnce = 256, kWindowsAtOnce = 32;
 static_assert(kWindowsAtOnce <= kViewSlots,
               "windows that are planned together must use different slots");
 
-// The memory of one picture: colour and alpha.
+// The planes of one picture: colour and alpha.
 class Canvas {
   public:
     Picture<float> start(const Camera& camera) {
@@ -45,8 +45,8 @@ class Canvas {
     std::vector<float> values_;
 };
 
-// A cell, the sum of its pixels' differences, and sums for the window. A cell at the
-// border of a picture may have less than kCellSide columns or rows.
+// A cell and the sum of its pixels' differences. Also adds up the sums of the window. A
+// cell at the border of a picture may have fewer than kCellSide columns or rows.
 struct Cell {
     size_t x0, y0, x1, y1;
     PixelValues sum;
@@ -119,7 +119,7 @@ struct CutWindow {
     std::vector<int32_t> clusters;
 };
 
-// Plans windows, several at once on all threads.
+// Plans windows, several of them at once on all threads.
 class Windows {
   public:
     Windows(const CutPictures& pictures, size_t count, size_t cuts_per_view)
@@ -128,7 +128,8 @@ class Windows {
           cuts_per_view_(cuts_per_view),
           views_(kViewSlots),
           windows_(kWindowsAtOnce) {}
-    // Returns a window. Numbers must be requested in ascending order from 0.
+    // Returns a window. The caller must request numbers in ascending order, starting
+    // with 0.
     const CutWindow& operator[](size_t number) {
         if (number % kWindowsAtOnce == 0)
             parallel_for(std::min(kWindowsAtOnce, count_ - number), 1,
@@ -159,14 +160,14 @@ class Windows {
     std::vector<CutWindow> windows_;
 };
 
-// The pictures of the asset in the windows of all slots.
+// Pictures of the asset, one for the view in each slot.
 class Targets {
   public:
     Targets(const FitTarget& target, uint64_t count)
         : target_(target), count_(count), pictures_(kViewSlots) {}
 
-    // Returns the picture of the asset for a window. If the window's view is new, the
-    // picture is drawn first.
+    // Returns the picture of the asset for a window. If the window's view is new, draws
+    // the picture first.
     const Canvas& picture_of(const CutWindow& window) {
         Canvas& picture = pictures_[window.plan.slot];
         if (!window.plan.is_new) return picture;
@@ -220,8 +221,8 @@ class GradientSum {
         parallel_for(index.size(), kGaussiansAtOnce,
                      [&](size_t g) { add_gradient(gradient, g, sum_, index[g]); });
     }
-    // Calls move(i, sum, num_windows) for each gaussian i that a window showed, and
-    // resets the sums.
+    // Calls move(i, sum, num_windows) for each gaussian i that at least one window
+    // showed. Then resets the sums.
     template <class Move>
     void move_shown(const Move& move) {
         parallel_for(shown_.size(), kGaussiansAtOnce, [&](size_t k) {
@@ -242,7 +243,7 @@ class GradientSum {
     std::vector<uint32_t> shown_;
 };
 
-// The gaussians of one window, their picture, and its backward pass.
+// The gaussians of one window, their picture, and the backward pass of the picture.
 class CutFrame {
   public:
     explicit CutFrame(const FitConfig& config)

@@ -1,6 +1,7 @@
-// Refinement on CUDA. Steps follow each other on the caller's stream. All windows of a
-// step are one frame, with one backward pass. Other threads, with their own streams,
-// plan the windows some steps ahead, compute their cuts, and draw the target pictures.
+// Refinement on CUDA. Steps are enqueued one after another on the caller's stream. All
+// windows of a step are drawn as one frame, with one backward pass. Other threads, each
+// with its own stream, work some steps ahead: they plan the windows, compute the cuts,
+// and draw the target pictures.
 
 #include "levels/refine_cuts_cuda.h"
 
@@ -23,17 +24,17 @@ namespace cuda {
 
 namespace {
 
-// The number of steps that each thread plans ahead.
+// Number of steps that each thread plans ahead.
 constexpr unsigned kStepsAhead = 3;
-// A slot's target may be overwritten while the preceding steps are drawn.
+// A slot's target may be overwritten while the steps before it are drawn.
 static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows,
               "no step that is being drawn may read it");
 constexpr unsigned kMostPlanners = 4;
 
-// Returns the number of threads that plan steps. The number must satisfy two
-// conditions. All windows of a slot belong to one thread, which owns the memory of the
-// slot's target. And a target is not overwritten while a step that is being drawn reads
-// it.
+// Returns the number of threads that plan steps. It satisfies two conditions. First,
+// all windows of a slot belong to one thread, which owns the memory of the slot's
+// target. Second, a target is never overwritten while it is needed by a step that is
+// being drawn.
 constexpr unsigned num_planners(unsigned windows_per_step) {
     unsigned num = kMostPlanners;
     while (num > 1 && (kViewSlots % (num * windows_per_step) != 0 ||
@@ -42,7 +43,7 @@ constexpr unsigned num_planners(unsigned windows_per_step) {
     return num;
 }
 
-// Pixels of the largest window.
+// Number of pixels in the largest window.
 constexpr size_t kMostPixels = kWidestWindowPx * kWidestWindowPx;
 
 FrameImage image_of(const Camera& camera, const PicturePlanes& planes) {
@@ -75,7 +76,8 @@ FrameBatch batch_of(const DeviceBuffer<GaussianRows<const float>>& model,
             .has_depth = false};
 }
 
-// The gaussians of a step's windows, their pictures, and the backward pass.
+// The gaussians of a step's windows, their pictures, and the backward pass of the
+// pictures.
 class StepFrame {
   public:
     StepFrame(const FitConfig& config, const GaussianRows<const float>& rows,
@@ -86,7 +88,7 @@ class StepFrame {
           stream_(stream),
           model_(Span<const GaussianRows<const float>>{&rows, 1}, stream) {}
 
-    // Returns when it is certain that the buffers suffice.
+    // Returns as soon as the buffers are known to suffice.
     void draw(const DeviceWindows& windows) {
         const std::unique_ptr<Drawing> drawing = frame_.draw(
             batch_of(model_, windows),
@@ -98,9 +100,10 @@ class StepFrame {
         num_slots_ = counters.slots;
         num_items_ = static_cast<unsigned>(counters.items);
     }
-    // Returns the gradients of the items' gaussians, with kItemSize rows per item. The
-    // windows must have the gradients of their pixels. The gradients of items that
-    // begin before row `first_wanted` are undefined.
+    // Returns the gradients of the items' gaussians, with kItemSize rows per item.
+    // Before the call, the planes of the windows must have the gradients of their
+    // pixels. The gradients of items that begin before row `first_wanted` are
+    // undefined.
     GaussianRows<float> backward(const DeviceWindows& windows, uint64_t first_wanted) {
         const size_t count = size_t(kItemSize) * num_items_;
         const GaussianRows<float> gradient =
@@ -188,7 +191,7 @@ struct PlannedStep {
     Event made, used;
 };
 
-// Draws pictures of the asset.
+// Draws pictures of the asset as targets.
 class TargetPainter {
   public:
     TargetPainter(const DeviceFitTarget& target, const DeviceTable& table, cudaStream_t stream)
@@ -197,8 +200,8 @@ class TargetPainter {
           stream_(stream),
           model_(Span<const GaussianRows<const float>>{&target.rows, 1}, stream) {}
 
-    // Draws the asset in a window. `windows` is temporary memory. The result is in
-    // `picture`, and belongs to the stream.
+    // Draws the asset in a window. `windows` is temporary memory. The result is stored
+    // in `picture`, and may be used on the same stream.
     ReadPlanes draw(const ClusterTable& table, const AssetView& view, WindowTables& windows,
                     DeviceBuffer<float>& picture) {
         const Camera camera = view.window.scaled(view.samples);
@@ -237,12 +240,13 @@ class TargetPainter {
     Frame frame_;
 };
 
-// Plans the windows of steps ahead of time, in other threads, because choosing the
-// tolerances of a step takes as long as the step on the device. A step waits for the
-// device only once.
+// Plans the windows of steps ahead of time, in other threads. Otherwise the device
+// would often wait, because choosing the tolerances of a step takes as long as the step
+// itself. A step only waits once for the device.
 class StepsAhead {
   public:
-    // If `target` is null, each window has its own view, and no target picture.
+    // If `target` is null, there are no target pictures, and each window has a view of
+    // its own.
     StepsAhead(const CutPictures& pictures, const DeviceTable& table, const Canvases& canvases,
                uint64_t num_windows, unsigned windows_per_step, unsigned cuts_per_view,
                const DeviceFitTarget* target, cudaStream_t stream)
@@ -261,7 +265,7 @@ class StepsAhead {
           steps_(kStepsAhead * num_threads_),
           ahead_(num_steps(), num_threads_, kStepsAhead * num_threads_,
                  [this](uint64_t number) { make(number); }) {}
-    // Wait for the stream, because steps on the device read the members.
+    // Wait for the stream, because steps on the device may still read the members.
     ~StepsAhead() { cudaStreamSynchronize(stream_); }
 
     uint64_t num_steps() const {
@@ -345,7 +349,8 @@ class StepsAhead {
     std::vector<Worker> workers_;
     std::vector<View> views_;
     std::vector<PlannedStep> steps_;
-    Ahead ahead_;  // The last member, because its threads use all other members.
+    Ahead ahead_;  // This must be the last member, because its threads use all other
+                   // members.
 };
 
 // Computes the gradients of the loss with respect to the pixels of a step's windows.
@@ -381,8 +386,8 @@ class Comparison {
     DeviceBuffer<WindowSlopes> slopes_;
 };
 
-// Returns the grid of kernels that process the gaussians of the clusters from `first`
-// on.
+// Returns the grid for kernels that process the gaussians of clusters, starting with
+// cluster `first`.
 dim3 grid_of_clusters(const ClusterTable& table, size_t first) {
     int64_t most = 1;
     for (size_t c = first; c < table.num_clusters(); ++c)
@@ -413,7 +418,8 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison,
         offset.begin());
     const dim3 grid = grid_of_clusters(pictures.table, first_moving);
     check(cudaStreamSynchronize(stream),
-          // From here on, all streams see the memory that pictures are drawn from.
+          // After this wait, every stream can read the memory that pictures are drawn
+          // from.
           "refine_cuts");
     StepsAhead ahead(pictures, table, canvases, uint64_t(config.steps) * windows_per_step,
                      windows_per_step, static_cast<unsigned>(comparison.cuts_per_view), &target,
@@ -442,8 +448,8 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
     const DeviceBuffer<float> grey(3 * rows.size, stream);
     if (rows.size > 0)
         check(cudaMemsetAsync(grey.data(), 0, grey.bytes(), stream), "cudaMemsetAsync");
-    // The gradient with respect to a grey colour measures how much of a gaussian is
-    // visible.
+    // If a gaussian is grey, the gradient with respect to its colour measures how much
+    // of it is visible.
     GaussianRows<const float> rows_in_grey = rows;
     rows_in_grey.sh = grey.data();
     rows_in_grey.sh_degree = 0;

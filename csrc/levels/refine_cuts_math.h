@@ -1,6 +1,6 @@
 #pragma once
 
-// Formulas of refine_cuts() and weigh_cuts(), for the CPU and CUDA.
+// Formulas of refine_cuts() and weigh_cuts(), shared by the CPU and CUDA.
 
 #include <cfloat>
 #include <vector>
@@ -18,7 +18,7 @@ inline size_t num_pixels(const Camera& camera) {
 }
 
 // Returns value k of a pixel, averaged over `samples` x `samples` pixels of a larger
-// picture. `width` is the width of the small picture.
+// picture. `width` is the width of the smaller picture.
 V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_values, size_t k,
                                  size_t x, size_t y, int samples) {
     const auto side = static_cast<size_t>(samples);
@@ -43,22 +43,22 @@ struct ReadPlanes {
     }
 };
 
-// Side, px, of the cells whose mean differences are part of the loss.
+// Size, px, of the cells whose mean differences are part of the loss.
 constexpr size_t kCellSide = 4;
 
 // Returns the number of cells along a side.
 V3DG_HD inline size_t num_cells(size_t side) { return (side + kCellSide - 1) / kCellSide; }
 
-// Returns the number of pixels of all cells of a camera's picture, including those that
-// are beyond its border.
+// Returns the number of pixels in all cells of a camera's picture. It includes pixels
+// of cells beyond the picture's border.
 inline size_t num_pixels_of_cells(const Camera& camera) {
     return num_cells(static_cast<size_t>(camera.width)) *
            num_cells(static_cast<size_t>(camera.height)) * kCellSide * kCellSide;
 }
 
 // Replaces the differences between two pictures at a pixel by the gradients of the
-// loss, as if the picture's weight were 1. `sum` has the differences of the pixel's
-// cell. Returns the pixel's loss, without the part of the cell.
+// loss, for a picture of weight 1. `sum` has the summed differences of the pixel's
+// cell. Returns the pixel's loss, without the loss of the cell.
 V3DG_HD inline float put_slopes(const LossWeights& loss, const PixelValues& sum,
                                 PixelValues& pixel) {
     float pixel_loss = 0;
@@ -76,10 +76,11 @@ struct WindowSums {
     static constexpr int kValues = 9;
     double values[kValues];
 
-    // The loss, without the parts of cells and of the whole window.
+    // The loss, without the losses of cells and of the whole window.
     V3DG_HD double& loss() { return values[0]; }
     V3DG_HD double loss() const { return values[0]; }
-    // Picture minus target, and the target: premultiplied colour, and alpha.
+    // Sum of picture minus target, and sum of the target. The channels are
+    // premultiplied colour and alpha.
     V3DG_HD double& difference(int k) { return values[1 + k]; }
     V3DG_HD double difference(int k) const { return values[1 + k]; }
     V3DG_HD double& target(int k) { return values[5 + k]; }
@@ -97,22 +98,23 @@ struct WindowSums {
     }
 };
 
-// The common part of the gradients of a window's pixels.
+// The part of the gradient that all pixels of a window have in common.
 struct WindowSlopes {
-    float weight;       // of the picture
-    float of_means[4];  // gradient of the loss of the window's sums, without the weight
+    float weight;       // weight of the picture
+    float of_means[4];  // gradient of the loss of the window's sums, before weighting
 
     V3DG_HD float weighed(float slope, int k) const { return weight * (slope + of_means[k]); }
 };
 
-// Sets the gradient of the loss of a window's sums at each pixel. That loss is linear in
-// the difference of the sums, and quadratic where the difference is smaller than
-// kSmallMeans of the target's sum, so that it hardly disturbs windows whose sums are
-// right. The absolute differences of pixels and cells are least at medians. Medians are
-// darker than means, and have less alpha where gaussians are faint. A colour counts as
-// at least kLeastColor of alpha, because a relative error of black is not visible.
+// Parameters of the loss of a window's sums. This loss is needed because absolute
+// differences of pixels and cells are smallest at medians. Medians are darker than
+// means, and have less alpha where gaussians are faint. The loss is linear in the
+// difference of the sums. It is quadratic where that difference is smaller than
+// kSmallMeans of the target's sum, so that windows whose sums are right are hardly
+// disturbed. A colour counts as at least kLeastColor of alpha, because a relative error
+// of black is not visible.
 constexpr double kSmallMeans = 0.02, kLeastColor = 0.1;
-constexpr double kLeastSum = 1e-30;  // keeps the quotient finite where the target is empty
+constexpr double kLeastSum = 1e-30;  // keeps the quotient finite if the target is empty
 V3DG_HD inline void put_slopes_of_means(const LossWeights& loss, float means,
                                         const WindowSums& sums, float of_means[4]) {
     for (int k = 0; k < 4; ++k) {
@@ -120,21 +122,22 @@ V3DG_HD inline void put_slopes_of_means(const LossWeights& loss, float means,
         const double target = max_of(sums.target(k), kLeastColor * sums.target(3));
         const auto relative =
             static_cast<float>(sums.difference(k) / max_of(kSmallMeans * target, kLeastSum));
-        // In this order the result is finite for NaN, too.
+        // The order of min_of() and max_of() gives a finite result for NaN, too.
         of_means[k] = means * weight * max_of(min_of(relative, 1.0f), -1.0f);
     }
 }
 
-// Returns the weight of a picture: one over its loss. So the sum over pictures measures
-// relative losses. Otherwise large pictures would get worse, because coarse levels have
-// larger absolute errors in small pictures. If the loss per pixel is below kLeastLoss,
-// the picture is accurate enough, and the weight hardly grows further.
+// Returns the weight of a picture, one over its loss, so that the sum over pictures
+// measures relative losses. Otherwise, fitting small pictures, in which coarse levels
+// have larger absolute errors, would make large pictures worse. If the loss per pixel
+// is below kLeastLoss, the picture is accurate enough, so its weight hardly grows
+// further.
 constexpr double kLeastLoss = 1e-4;
 V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
 }
 
-// Returns the common part of the gradients of a window's pixels.
+// Returns the part of the gradient that all pixels of a window have in common.
 V3DG_HD inline WindowSlopes slopes_of_window(const LossWeights& loss, float means,
                                              const WindowSums& sums, double num_pixels) {
     WindowSlopes slopes;
@@ -143,14 +146,14 @@ V3DG_HD inline WindowSlopes slopes_of_window(const LossWeights& loss, float mean
     return slopes;
 }
 
-// Sets the gradient of a pixel for the loss "sum of the first channel".
+// Sets the gradient of a pixel for a loss that is the sum of the first channel.
 V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
     for (int k = 0; k < 3; ++k) color[k] = k == 0 ? 1.0f : 0.0f;
     alpha = 0;
 }
 
 // Returns the step sizes for a gaussian that `num_windows` of the step's windows show.
-// The relative noise of a sum of n gradients falls with sqrt(n), so step sizes grow
+// The relative noise of a sum of n gradients falls with sqrt(n), so step sizes may grow
 // with sqrt(n).
 V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
     const float factor = ::sqrtf(static_cast<float>(num_windows));
@@ -160,8 +163,8 @@ V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
     return step;
 }
 
-// The moments of Adam. Value k of gaussian i, out of n gaussians, is at index k * n +
-// i.
+// The moments of Adam. Value k of gaussian i is at index k * n + i, where n is the
+// number of gaussians.
 struct Moments {
     float *m, *v;
 };
@@ -177,15 +180,15 @@ V3DG_HD inline void add_gradient(const GaussianRows<const float>& source, size_t
     for (size_t k = 0; k < num_sh; ++k) sum.sh[num_sh * to + k] += source.sh[num_sh * from + k];
 }
 
-// Performs one step of Adam for gaussian i. Its gradient is row g of `gradient`. Steps
-// of positions are relative to `radius`. Scales move in their logarithm and opacities
-// in their logit, within the ranges of a fit.
+// Performs one step of Adam for gaussian i. Its gradient is in row g of `gradient`.
+// Steps of positions are relative to `radius`. Scales are updated as logarithms and
+// opacities as logits, within the ranges of a fit.
 V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
                                   const GaussianRows<const float>& gradient, size_t g, float radius,
                                   const FitStep& step, float beta2, const Moments& moments) {
     size_t moment = i;
     const auto moved = [&](float value, float slope, float size) {
-        // A NaN or infinity would stay in the moments.
+        // A NaN or infinity would stay in the moments forever.
         if (!(::fabsf(slope) <= FLT_MAX)) slope = 0;
         const float next = adam_step(value, slope, moments.m[moment], moments.v[moment], size,
                                      beta2, step.correction1, step.correction2);
@@ -223,8 +226,8 @@ V3DG_HD inline void copy_gaussian(const GaussianRows<const float>& source, size_
     for (size_t k = 0; k < num_sh; ++k) rows.sh[num_sh * to + k] = source.sh[num_sh * from + k];
 }
 
-// Copies a gaussian with grey colour of SH degree 0. The gradient with respect to this
-// colour then measures how much of the gaussian is visible.
+// Copies a gaussian with a grey colour and SH degree 0. The gradient with respect to
+// this colour measures how much of the gaussian is visible.
 V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t from,
                                  const GaussianRows<float>& rows, size_t to) {
     copy_shape(source, from, rows, to);
@@ -232,7 +235,8 @@ V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t
 }
 
 // Returns the fraction of a picture that a gaussian covers. `gradient` is the gradient
-// of the picture's sum with respect to the colour of a gaussian from copy_in_grey().
+// of the picture's sum with respect to the colour of a gaussian that copy_in_grey()
+// wrote.
 V3DG_HD inline double blend_weight(float gradient, size_t num_pixels) {
     return static_cast<double>(gradient) / (kShBase0 * static_cast<double>(num_pixels));
 }
@@ -242,8 +246,8 @@ V3DG_HD inline size_t num_values(int sh_degree) {
     return 11 + 3 * static_cast<size_t>(num_sh_bases(sh_degree));
 }
 
-// Divides a block of memory into rows of `count` gaussians, with num_values() floats
-// per gaussian. Values that must be aligned to 16 bytes come first.
+// Divides a block of memory into rows for `count` gaussians, with num_values() floats
+// per gaussian. Values with an alignment of 16 bytes come first.
 V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_degree) {
     const size_t num_sh = 3 * static_cast<size_t>(num_sh_bases(sh_degree));
     float* rest = memory + (4 + num_sh) * count;

@@ -1,8 +1,8 @@
 #pragma once
 
-// The kernels of refine_cuts() and weigh_cuts(), for the work before and after drawing
-// and its backward pass. In kernels of pixels, a row of blocks processes one window. In
-// kernels of gaussians, a block processes up to kItemSize gaussians of one cluster.
+// The kernels of refine_cuts() and weigh_cuts(), for the work before drawing and after
+// its backward pass. In kernels over pixels, a row of blocks processes one window. In
+// kernels over gaussians, a block processes up to kItemSize gaussians of one cluster.
 
 #include "base/launch.cuh"
 #include "levels/cut_windows_cuda.h"
@@ -15,8 +15,8 @@ namespace {
 
 constexpr unsigned kThreads = 256;
 
-// Averages a picture that is `samples` times as wide and high. One thread per pixel of
-// the result.
+// Averages a picture that is `samples` times as wide and high. Launched with one thread
+// per pixel of the result.
 __global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsigned width,
                                unsigned height, int samples) {
     const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -27,7 +27,7 @@ __global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsi
     picture.alpha[pixel] = box_average(larger.alpha, width, 1, 0, x, y, samples);
 }
 
-// The pixel of a thread in a window.
+// The pixel that a thread processes in a window.
 struct WindowPixel {
     const FrameImage& image;
     size_t width, height, pixel;
@@ -41,7 +41,7 @@ struct WindowPixel {
 };
 
 // A pixel of a window, for kernels in which kCellSide x kCellSide neighbouring threads
-// have a cell.
+// process a cell.
 struct CellPixel {
     size_t width, x, y;
     bool is_in_window;
@@ -57,7 +57,7 @@ struct CellPixel {
     }
     __device__ size_t pixel() const { return y * width + x; }
 
-    // Sums a value over the threads of the cell, in each of them.
+    // Sums a value over the threads of the cell. Each of them gets the sum.
     __device__ static float sum(float value) {
 #pragma unroll
         for (int offset = kCellSide * kCellSide / 2; offset > 0; offset /= 2)
@@ -82,8 +82,8 @@ __device__ inline void write_block_sums(const WindowSums& of_thread, WindowSums&
 }
 
 // Computes the gradients of pixels as if all windows had the weight 1, and the sums of
-// each block. One thread per pixel. `planes` has room for `most_pixels` pixels per
-// window.
+// each block. Launched with one thread per pixel. `planes` must have room for
+// `most_pixels` pixels per window.
 __global__ void __launch_bounds__(kThreads)
     compare_kernel(const WindowTables* windows, LossWeights loss, size_t most_pixels, float* planes,
                    WindowSums* sums_of_block) {
@@ -109,8 +109,8 @@ __global__ void __launch_bounds__(kThreads)
     write_block_sums(sums, sums_of_block[size_t(w) * gridDim.x + blockIdx.x]);
 }
 
-// Computes the common part of the gradients of each window from the sums of its blocks.
-// One block per window.
+// Computes, from the sums of its blocks, the part of the gradient that all pixels of a
+// window have in common. Launched with one block per window.
 __global__ void __launch_bounds__(kThreads)
     weigh_kernel(const WindowTables* windows, LossWeights loss, float means,
                  const WindowSums* sums_of_block, unsigned num_blocks, WindowSlopes* slopes) {
@@ -126,8 +126,8 @@ __global__ void __launch_bounds__(kThreads)
         slopes_of_window(loss, means, of_window, static_cast<double>(image.width) * image.height);
 }
 
-// Adds the gradient of the window's sums to those of its pixels, and multiplies them by
-// the window's weight. One thread per pixel.
+// Adds the gradient of the window's sums to the gradients of its pixels, and multiplies
+// the result by the window's weight. Launched with one thread per pixel.
 __global__ void __launch_bounds__(kThreads)
     weigh_slopes_kernel(const WindowTables* windows, size_t most_pixels,
                         const WindowSlopes* of_windows, float* planes) {
@@ -142,7 +142,8 @@ __global__ void __launch_bounds__(kThreads)
     slopes.alpha[p.pixel] = of_windows[w].weighed(slopes.alpha[p.pixel], 3);
 }
 
-// Writes the gradients of the loss "sum of the first channel". One thread per pixel.
+// Writes the gradients of a loss that is the sum of the first channel. Launched with
+// one thread per pixel.
 __global__ void __launch_bounds__(kThreads)
     sum_slope_kernel(const WindowTables* windows, size_t most_pixels, float* planes) {
     const WindowPixel p(*windows, blockIdx.y);
@@ -151,7 +152,7 @@ __global__ void __launch_bounds__(kThreads)
     put_sum_slopes(out.color + 3 * p.pixel, out.alpha[p.pixel]);
 }
 
-// The locations of the gradients of a cluster's gaussians, in each window of a step.
+// For each window of a step, the location of the gradients of a cluster's gaussians.
 struct ShownCluster {
     const int32_t* item_of_cluster;
     const uint32_t* num_items;
@@ -159,7 +160,7 @@ struct ShownCluster {
     unsigned num_windows;
 
     // Calls visit(window, row) for each window that shows gaussian `i` of cluster `c`,
-    // in the order of windows. `row` is the gaussian's row in the gradients.
+    // in the order of windows. `row` is the row of the gaussian's gradient.
     template <class Visit>
     __device__ void for_each_window(size_t c, size_t i, const Visit& visit) const {
         size_t first = 0;
@@ -171,9 +172,9 @@ struct ShownCluster {
     }
 };
 
-// Moves the gaussians of the clusters from `first_cluster` on. The gradients of a
-// gaussian are summed over the windows; the sum overwrites the gradient of the first
-// window.
+// Moves the gaussians of all clusters from `first_cluster` on. The gradients of a
+// gaussian are summed over the windows, and the sum overwrites the gradient of the
+// first window.
 __global__ void __launch_bounds__(kItemSize)
     move_kernel(ShownCluster shown, Span<const int64_t> offset, size_t first_cluster,
                 GaussianRows<float> rows, GaussianRows<float> gradient, const float* radius,
@@ -194,7 +195,7 @@ __global__ void __launch_bounds__(kItemSize)
                   step_of_windows(step, num_windows), beta2, moments);
 }
 
-// Adds how much windows show of each gaussian, and counts the windows whose cuts
+// Adds how much of each gaussian the windows show, and counts the windows whose cuts
 // contain the gaussian.
 __global__ void __launch_bounds__(kItemSize)
     weight_kernel(ShownCluster shown, const WindowTables* windows, Span<const int64_t> offset,

@@ -2,13 +2,13 @@
 
 // Blends a batch of records, nearest first, over the pixels of a tile.
 //
-// Many gaussians cover only a few pixels. Therefore a warp does not test every record
-// at every pixel of its sub-tile. It processes 32 records at once: each lane computes a
-// bit mask of the pixels that one record reaches. The masks are then transposed, so
-// that each pixel visits only its own records.
+// Many gaussians cover only a few pixels, so testing every record at every pixel would
+// be slow. Instead, a warp processes 32 records at once: each lane computes a bit mask
+// of the pixels that one record reaches. The masks are then transposed, so that each
+// pixel visits only its own records.
 //
 // If gaussians cover many pixels, a lane blends two adjacent pixels, which share most
-// records, loads and terms of a row. A sub-tile then has 16 x 4 pixels, otherwise 8 x
+// records, loads and terms of a row. A sub-tile then has 16 x 4 pixels instead of 8 x
 // 4. A pixel gets the same bits in both cases.
 
 #include <type_traits>
@@ -48,9 +48,9 @@ __device__ inline void store(const float (&from)[2], float* to) {
     *reinterpret_cast<float2*>(to) = {from[0], from[1]};
 }
 
-// Load a vector of a record from an address in shared memory. The asm has no memory
-// clobber, so plain stores are not ordered before it. This is safe: only copy_async()
-// writes records, and the caller has waited for it.
+// Load part of a record from an address in shared memory. The asm has no memory
+// clobber, so the compiler may move it across plain stores. This is safe, because only
+// copy_async() writes records, and the caller has waited for it.
 template <int kVector>
 __device__ float4 vector_at(uint32_t place) {
     float4 v{};
@@ -71,16 +71,16 @@ __device__ inline float2 rest_at(uint32_t place) {
     return v;
 }
 
-// Stores an element of BlendShared::list at an address in shared memory.
+// Writes an element of BlendShared::list, given its address in shared memory.
 __device__ inline void list_record(uint32_t place, uint32_t record) {
 #ifdef __CUDA_ARCH__
     asm volatile("st.shared.u16 [%0], %1;" ::"r"(place), "h"(static_cast<uint16_t>(record)));
 #endif
 }
 
-// Loads an element of BlendShared::list. The code that writes the list ends with a
-// memory clobber. The load extends the element to 32 bits; after a plain load, nvcc
-// would add an instruction for this.
+// Reads an element of BlendShared::list, and extends it to 32 bits. For a plain load,
+// nvcc would add an instruction for the extension. The code that writes the list ends
+// with a memory clobber, so the load comes after the writes.
 __device__ inline uint32_t listed_at(uint32_t place) {
     uint32_t listed = 0;
 #ifdef __CUDA_ARCH__
@@ -89,7 +89,8 @@ __device__ inline uint32_t listed_at(uint32_t place) {
     return listed;
 }
 
-// Returns the lowest `count` bits, in one instruction. Precondition: `count` < 32.
+// Returns the lowest `count` bits. The asm is a single instruction. Precondition:
+// `count` < 32.
 __device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
     uint32_t low = 0;
 #ifdef __CUDA_ARCH__
@@ -112,7 +113,7 @@ __device__ uint32_t subs_of(uint32_t blocks) {
     return kPixels == 1 ? blocks & 0x55555555u : (blocks | blocks >> 2) & 0x11111111u;
 }
 
-// Clears the bits of blocks in s.alive_blocks if all pixels of the block have stopped.
+// Removes blocks from s.alive_blocks if all of their pixels have stopped.
 template <int kPixels, class Shared>
 __device__ void publish_alive(bool is_alive, unsigned sub, Shared& s) {
     constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes per row of a block
@@ -149,8 +150,8 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
-// Returns the stop rule in a register. If the rule were a kernel argument, nvcc would
-// load it again for each gaussian.
+// Copies the stop rule into a register. As a kernel argument, nvcc would load it again
+// for each gaussian.
 template <class Stop, class Shared>
 __device__ Stop stop_of(const Shared& s) {
     if constexpr (std::is_same_v<Stop, StopsBefore>)
@@ -164,9 +165,8 @@ template <int kPixels, bool kWithDepth, class Stop, class Shared>
 __device__ void blend_sub(unsigned sub, int left, int top, Shared& s) {
     const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
-    // The asm hides the lane index from the compiler. Otherwise the compiler would keep
-    // values that depend on the lane in registers between batches, and spill other
-    // values.
+    // The asm hides from the compiler where `lane` comes from. Otherwise, nvcc would
+    // keep values derived from it in registers between batches, and spill other values.
     asm volatile("" : "+r"(lane));
     // The list is filled from the end of the array to its beginning.
     constexpr uint32_t kEach = sizeof(s.list[0][0]);
@@ -199,8 +199,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, Shared& s) {
     load(pixels.transmittance + place, p.transmittance);
     for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
     if (kWithDepth) load(s.depth + place, p.depth);
-    // If one of a lane's two pixels has stopped, that pixel is moved to infinity, so
-    // that no gaussian reaches it.
+    // If one of a lane's two pixels has stopped, it is moved to infinity, where no
+    // gaussian reaches it.
     constexpr float kNowhere = INFINITY;
     bool alive = false;
     for (int k = 0; k < kPixels; ++k) {
@@ -221,14 +221,14 @@ __device__ void blend_sub(unsigned sub, int left, int top, Shared& s) {
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
-        // Load the next index ahead of its use. The value after the last record is not
-        // used.
+        // Load the next index early, to hide the latency. After the last record, the
+        // loaded value is not used.
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = listed_at(last_of_group + kEach * highest);
         while (bits != 0) {
-            // Read the record as vectors. If it were copied to a Record first, nvcc
-            // would round the falloff differently than for the other number of pixels,
-            // and than in the backward pass.
+            // Read the record as vectors. If the code copied it to a Record first, nvcc
+            // would round the falloff differently in the two variants (one or two
+            // pixels) and in the backward pass.
             const float4 a = vector_at<0>(next), b = vector_at<1>(next);
             const float2 c = rest_at(next);
             bits = low_bits(bits, highest);
@@ -249,8 +249,9 @@ __device__ void blend_sub(unsigned sub, int left, int top, Shared& s) {
             }
             if (!alive) bits = 0;
         }
-        // With StopsBefore, a stopped pixel keeps a transmittance above the threshold,
-        // so `alive` may be true although both pixels of the lane have stopped.
+        // With StopsBefore, a stopped pixel keeps a transmittance above the threshold.
+        // `alive` may then be true although both pixels of the lane have stopped, so
+        // test their positions.
         if (kPixels > 1) alive = p.x[0] != kNowhere || p.x[kPixels - 1] != kNowhere;
         __syncwarp();
     }
@@ -268,8 +269,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, Shared& s) {
 template <int kPixels, bool kWithDepth, class Stop, class Shared>
 __device__ void blend_batch(uint32_t reached, int left, int top, Shared& s) {
     const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
-    // Lane i stands for the sub-tile whose bit in `subs` is i, and counts the sub-tiles
-    // before it.
+    // Each lane represents a sub-tile, and counts the reached sub-tiles before it. The
+    // sub-tile's bit in `subs` is the lane's index.
     const uint32_t before = subs >> lane & 1 ? __popc(subs & ((1u << lane) - 1)) : ~0u;
     // Warp w starts with the w-th sub-tile. A warp that is done claims the next one.
     uint32_t taken = threadIdx.x / 32;

@@ -1,6 +1,6 @@
 #pragma once
 
-// Takes pieces from a tile's list, nearest first, and sorts each piece. Entries that
+// Takes pieces from a tile's list, nearest first, and sorts each of them. Entries that
 // cover only stopped pixels are skipped.
 
 #include "frame/record.cuh"
@@ -11,15 +11,15 @@ namespace cuda {
 
 constexpr int kWindow = 512;             // entries that are read together
 constexpr int kPiece = 3 * kWindow / 2;  // most entries that are sorted together
-// Log2 of the buckets when a list is spread a second time.
+// Log2 of the number of buckets when a bucket is spread again.
 constexpr int kLog2SpreadAgain = 10;
 constexpr int kLog2Sort = 9;         // log2 of the buckets for sorting a piece
 constexpr uint32_t kMostAlike = 12;  // a bucket with more entries is crowded
-constexpr int kFewEntries = 64;      // up to this many entries are sorted without buckets
+constexpr int kFewEntries = 64;      // lists up to this length need no buckets
 constexpr int kBlendBatch = 192;     // records that are blended together
-// The largest number of times that a list is spread again. The range of the first level
-// is estimated. Each further level resolves at least 4 bits: first of the depth (26
-// bits), then of the order (28 bits).
+// Maximum number of times that a list is spread. The range of the first level is only
+// estimated. Each further level resolves at least 4 bits, first of the depth (26 bits),
+// then of the order (28 bits).
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 
@@ -34,24 +34,25 @@ struct SubTile {
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
-// A part of the list that is in bucket order, and ends before `end`. It is in
-// lists.entries or in scratch memory.
+// A part of the list that is in bucket order. Only its entries before `end` are used.
+// It is stored in lists.entries or in scratch memory.
 struct SpreadLevel {
     uint32_t end;
     bool in_scratch;
     Buckets buckets;
 };
 
-// Counters for filtering a window of a list with several warps. There are three in
-// turn: one is in use, the previous one may still be read, and the next one is cleared.
+// Counters that warps share while they filter a window of a list. Three instances are
+// used in turn: one is active, the previous one may still be read, and the next one is
+// being cleared.
 struct ListWindow {
     uint32_t taken;
-    uint32_t end;  // first entry behind the window
+    uint32_t end;  // index after the last entry of the window
 };
 
-// The state of a tile's pixels, in areas of 8 x 4 pixels. In areas of odd columns, the
-// upper and lower halves are exchanged, so that the pixels of half a warp are in
-// different banks. This holds for one and for two pixels per lane.
+// The state of a tile's pixels, stored in areas of 8 x 4 pixels. In areas of odd
+// columns, the upper and lower halves are exchanged, so that the pixels of half a warp
+// are in different banks, both with one and with two pixels per lane.
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
@@ -62,10 +63,10 @@ template <int kBlendThreads>
 struct BlendShared {
     static constexpr int kThreads = kBlendThreads, kWarps = kThreads / 32;
     static_assert(2 * kFewEntries <= kThreads, "two threads compute the rank of each entry");
-    // Loads in flight per thread when a window is read.
+    // Number of loads per thread that are in flight when a window is read.
     static constexpr int kAtOnce = kWindow / kThreads;
-    // The number of sampled entries (one per thread) in crowded buckets, above which
-    // finer buckets are used.
+    // If more sampled entries than this are in crowded buckets, finer buckets are used.
+    // One entry per thread is sampled.
     static constexpr uint32_t kMostCrowded = kThreads / 4;
 
     EntryKey key[kPiece];  // the entries of the piece, in any order
@@ -76,30 +77,30 @@ struct BlendShared {
             uint32_t warp_sum[kWarps];
             uint16_t by_bucket[kPiece];
         };
-        // The batch's records, without their boxes.
+        // The records of the batch, without their boxes.
         float4 record[kRecordVectors][kBlendBatch];
     };
     uint16_t sorted[kPiece];  // indices into `key`
-    // Live blocks that each record of the batch may reach.
+    // For each record of the batch, the live blocks that it may reach.
     uint32_t blocks[kBlendBatch];
-    // Per warp: the records that may reach its sub-tile, as addresses in shared memory.
-    // An array is filled from its end to its beginning. Its first element is never set,
-    // but may be loaded ahead.
+    // For each warp, the addresses in shared memory of the records that may reach its
+    // sub-tile. A list is filled from its end to its beginning. Its first element is
+    // never set, but may be loaded early.
     uint16_t list[kWarps][kBlendBatch + 1];
     TilePixels pixels;
     uint32_t alive_blocks;  // one bit per block, as in blocks_of(TileEntry)
     uint32_t reached[2];    // blocks that a batch reaches, for even and odd batches
-    // The number of blocks that each record reaches, summed over a batch; for even and
-    // odd batches.
+    // Sum, over the records of a batch, of the number of blocks that each record
+    // reaches. The two elements are for even and odd batches.
     uint32_t num_covered[2];
     uint32_t subs_taken;  // number of sub-tiles claimed so far
     ListWindow window[3];
-    uint32_t lowest, highest;  // range of key_depth() in the piece
+    uint32_t lowest, highest;  // smallest and largest key_depth() in the piece
     uint32_t crowded;          // number of sampled entries in crowded buckets
     float stops_behind;        // StopsBehind::transmittance, or kStopsBefore
     SpreadLevel level[kMostSpreadLevels];
-    // Sums of weight * depth, in the order of TilePixels. This member must be the last
-    // one: frames without depth do not allocate it.
+    // Sums of weight * depth, in the order of TilePixels. This must be the last member,
+    // because frames without depth do not allocate it.
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared<256>) < 1 << 15,
@@ -121,8 +122,9 @@ __device__ uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint
     return last;
 }
 
-// Adds to the piece the entries of [first, end) that cover live pixels and whose bucket
-// is before `beyond`. Returns the index at which it stopped, and the size of the piece.
+// Appends entries of [first, end) to the piece, if they cover live pixels and their
+// bucket is before `beyond`. Returns the index at which it stopped, and the new size of
+// the piece.
 template <class Shared>
 __device__ uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
                              const Buckets& buckets, uint32_t beyond, uint32_t held,
@@ -181,8 +183,8 @@ __device__ uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t 
     return {min(end, window.end), held + window.taken};
 }
 
-// Returns whether entry `first` is blended before entry `second`. If their depths are
-// equal, but rounded, the depths of the records decide.
+// Returns whether entry `first` is blended before entry `second`. Keys have rounded
+// depths; if these are equal, the exact depths of the records are compared.
 __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPlanes& records) {
     const TileEntry one{first}, other{second};
     if (records.depth_of(one) != records.depth_of(other) || records.is_exact(other))
@@ -193,8 +195,8 @@ __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPla
     return depth_a != depth_b ? depth_a < depth_b : a < b;
 }
 
-// Returns how many of the elements [first, last) of by_bucket precede the element at
-// index p.
+// Returns how many of the elements [first, last) of by_bucket come before the element
+// at index p.
 template <class Shared>
 __device__ uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
                                  const RecordPlanes& records, const Shared& s) {
@@ -206,7 +208,8 @@ __device__ uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
         return before;
     }
     const uint32_t depth = records.depth_of(entry);
-    uint32_t num_alike = 0, last_alike = 0;  // entries of equal depth, other than p
+    uint32_t num_alike = 0, last_alike = 0;  // other entries with the same rounded
+                                             // depth
     for (uint32_t j = first; j < last; ++j) {
         const uint32_t other = records.depth_of(entry_at(j));
         before += other < depth;
@@ -215,8 +218,8 @@ __device__ uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
             last_alike = j;
         }
     }
-    // Lanes that must load records do so in the same iterations. Most lanes have one
-    // other entry of equal depth.
+    // In each iteration, all lanes that need records load them together. Most lanes
+    // have one other entry of equal depth.
     for (uint32_t j = last_alike; num_alike > 0; --j) {
         if (records.depth_of(entry_at(j)) != depth || j == p) continue;
         before += precedes(entry_at(j).key, entry.key, records);
@@ -225,8 +228,9 @@ __device__ uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
     return before;
 }
 
-// The steps of sorting a piece by buckets. The counter of a bucket is 0 first. Then it
-// is the first index of the bucket, and in the end the first index of the next bucket.
+// The steps of sorting a piece with buckets. Initially, the counter of each bucket is
+// 0. It then becomes the index of the bucket's first entry, and finally the index of
+// the next bucket's first entry.
 template <class SomeBuckets, class Shared>
 __device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
                               Shared& s) {
@@ -249,7 +253,7 @@ __device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket,
     __syncthreads();
 }
 
-// Sorts the piece: sets s.sorted.
+// Sorts the piece, and writes the result to s.sorted.
 template <class Shared>
 __device__ void sort_piece(const RecordPlanes& records, uint32_t count, Shared& s) {
     constexpr int kThreads = Shared::kThreads;
@@ -273,8 +277,8 @@ __device__ void sort_piece(const RecordPlanes& records, uint32_t count, Shared& 
     }
     if (few) return;
     count_buckets(buckets, s.bucket, count, s);
-    // Each entry is compared with every other entry of its bucket. A sample of entries
-    // shows whether most buckets are crowded, so that finer buckets are faster.
+    // Each entry is compared with every other entry of its bucket, which is slow in
+    // crowded buckets. A sample of entries estimates whether finer buckets are faster.
     const bool is_crowded =
         threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);

@@ -1,10 +1,11 @@
 // The backward pass of blending on CUDA. A block processes a tile, a warp 8 x 4 pixels,
-// a lane one pixel. They visit the tile's list front to back, like the forward pass.
+// and a lane one pixel. The list of the tile is processed front to back, as in the
+// forward pass.
 //
 // The gradient of a gaussian is a sum over pixels. A warp computes the sums of kHeld
-// gaussians at once: each lane stores its pixel's contribution to each gaussian; then
-// each lane adds up a row of 8 pixels for one gaussian. This costs a fifth of a warp
-// reduction per gaussian.
+// gaussians at once. First, each lane stores the contribution of its pixel to each of
+// these gaussians. Then, each lane adds up a row of 8 pixels for one gaussian. This
+// takes a fifth of the time of one warp reduction per gaussian.
 
 #include <cmath>
 
@@ -20,18 +21,20 @@ namespace {
 
 constexpr int kWarps = kFrameTileWidth * kFrameTileHeight / 32;
 constexpr int kThreads = 32 * kWarps;
-constexpr int kWarpWidth = 8, kWarpHeight = 4;  // px; the pixels of a warp
+constexpr int kWarpWidth = 8, kWarpHeight = 4;  // size in px of the area that a warp
+                                                // processes
 constexpr int kWarpColumns = kFrameTileWidth / kWarpWidth;
-constexpr int kBatch = 192;  // entries that are blended together
-constexpr int kPairs = 768;  // most (entry, warp) pairs of a batch
-constexpr int kHeld = 8;     // gaussians whose sums a warp computes together
+constexpr int kBatch = 192;  // number of entries that are processed together
+constexpr int kPairs = 768;  // maximum number of (entry, warp) pairs in a batch
+constexpr int kHeld = 8;     // number of gaussians whose sums a warp computes together
 constexpr int kGradientValues = sizeof(RecordGradient<float>) / sizeof(float);
 constexpr int kSizeValues = sizeof(CenterSize<float>) / sizeof(float);
 // The number of sums per gaussian.
 template <bool kWithSize>
 constexpr int kValuesOf = kGradientValues + (kWithSize ? kSizeValues : 0);
 static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
-constexpr int kTogether = 2;  // gaussians that are blended without a branch in between
+constexpr int kTogether = 2;  // number of gaussians that are blended between two
+                              // branches
 static_assert(kPairs >= kWarps, "a batch must have room for all pairs of an entry");
 static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
 
@@ -44,18 +47,19 @@ constexpr int kRowsStride = 40;   // row sums per value, padded to avoid bank co
 static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStride * sizeof(Share),
               "");
 
-// The data of a batch that is needed until its pairs are summed.
+// The data of a batch that must be kept until its pairs have been summed.
 struct Batch {
     uint32_t slot[kBatch];
     uint32_t first_pair[kBatch];
-    // Bit k is set if warp k, counted among the warps that may blend the entry, blended
-    // it.
+    // Which warps blended each entry. Bit k belongs to the k-th of the warps that may
+    // blend the entry.
     uint32_t took_part[kBatch];
 };
 
 template <bool kWithSize>
 struct Shared {
-    Record<float> record[kBatch + 1];  // the last record is invisible
+    Record<float> record[kBatch + 1];  // the last element is an invisible record for
+                                       // padding
     uint32_t warps[kBatch];            // bit w: warp w may blend the entry
     // Indices of entries that a warp may blend, padded with kBatch.
     uint8_t list[kWarps][kBatch + kHeld];
@@ -66,7 +70,7 @@ struct Shared {
                   // bank conflicts.
                   [kWarpWidth + 1];
     Share share[kWarps][kHeld * kShareStride];
-    Batch batch[2];  // one batch is blended while the previous one is summed
+    Batch batch[2];  // while one batch is blended, the previous one is summed
     float pair[kPairs][kValuesOf<kWithSize>];
     float d_background[kWarps][3];
 };
@@ -74,10 +78,10 @@ struct Shared {
 static_assert(sizeof(Shared<true>) <= 99 * 1024,
               "some devices have 99 KiB of shared memory per block");
 
-// Returns the warps whose pixels the record may reach, one bit per warp. Nothing is
-// rounded to pixel centres. A tile marks the gradient slots of all records that it
-// lists for a warp; so this test decides which gaussians have gradients, which may be
-// zero.
+// Returns a mask of the warps whose pixels the record may reach. It does not round to
+// pixel centres. A tile marks the gradient slots of all records that it lists for a
+// warp. Therefore this test decides which gaussians get a gradient; that gradient may
+// be zero.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     const int x0 = max(g.x0 - left, 0) / kWarpWidth,
               x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
@@ -104,14 +108,14 @@ struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
     float total,
-        // Sums of weight * (gradient with respect to the weight): `total` over all
-        // gaussians, `running` over the gaussians visited so far.
+        // Sums of weight * (gradient with respect to the weight). `total` covers all
+        // gaussians, `running` those visited so far.
         running;
     float transmittance;
 };
 
-// Reads the pixel at (column, row) of the picture. Adds its gradient of the background
-// to `d_background`.
+// Reads the pixel at (column, row) of the picture. Adds its part of the gradient of the
+// background to `d_background`.
 __device__ PixelGradient read_pixel(const FrameImage& image,
                                     const PictureGradient<float>& d_picture, int column, int row,
                                     float d_background[3]) {
@@ -146,9 +150,10 @@ __device__ PixelGradient read_pixel(const FrameImage& image,
     return p;
 }
 
-// Adds up the contributions of the warp's pixels to the gradients of `held` gaussians.
-// `entry` is the index, in the batch, of the lane's gaussian; lane = kHeld * (row of
-// pixels) + gaussian. (left, top) is the centre of the warp's first pixel.
+// Sums the contributions of the warp's pixels to the gradients of `held` gaussians. The
+// lane with index kHeld * r + k sums row r of the pixels for gaussian k; `entry` is the
+// index of that gaussian in the batch. (left, top) is the centre of the warp's first
+// pixel.
 template <bool kWithDepth, bool kWithSize>
 __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, int entry,
                        float left, float top) {
@@ -176,8 +181,8 @@ __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, i
     }
     const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums.of_falloff(f));
 
-    // The sums of rows overwrite the contributions. Lane l then adds up the values l /
-    // kHeld, l / kHeld + 4, and so on.
+    // The sums of rows overwrite the contributions. Lane l then sums the values with
+    // the indices l / kHeld, l / kHeld + 4, and so on.
     constexpr int kValues = kValuesOf<kWithSize>;
     const float value[kValuesOf<true>] = {
         d.u,   d.v,      d.l11,    d.l12,    d.l22,  d.log2_opacity,
@@ -200,7 +205,8 @@ __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, i
     __syncwarp();
 }
 
-// Blends one gaussian over the pixel, and returns the contribution to its gradient.
+// Blends a gaussian over the pixel, and returns the pixel's contribution to the
+// gaussian's gradient.
 template <bool kWithDepth>
 __device__ Share blend_vjp(const Record<float>& g, PixelGradient& p) {
     const Falloff<float> f = falloff_at(p.x, p.y, g.u, g.v, g.l11, g.l12, g.l22, g.log2_opacity);
@@ -235,7 +241,7 @@ __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, in
     for (int first = 0; first < count && alive; first += kHeld) {
         const int held = min(kHeld, count - first);
         for (int h = 0; h < held; h += kTogether) {
-            // The shares are stored after all loads, so that the loads overlap.
+            // Store all shares after the last load, so that the loads can overlap.
             Share share[kTogether];
 #pragma unroll
             for (int k = 0; k < kTogether; ++k)
@@ -249,8 +255,8 @@ __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, in
     if (!alive && lane == 0) atomicAnd(&s.alive, ~(1u << warp));
 }
 
-// Adds up the pairs of a batch's entries, and writes the slots. The work is divided
-// among `num_threads` threads.
+// Sums the pairs of each entry of a batch, and writes the gradient slots. `num_threads`
+// threads share the work.
 template <bool kWithSize>
 __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int num, int thread,
                              int num_threads, const GradientSlots& slots) {
@@ -272,8 +278,9 @@ __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int
     }
 }
 
-// Return the image and the gradient of a picture: the only one, or one of a batch. The
-// template parameter lets the compiler read a single picture from constant memory.
+// Return the image and the gradient of a picture. The template parameter tells whether
+// the picture is part of a batch; if not, the compiler can read it from constant
+// memory.
 template <bool kIsBatch>
 __device__ const FrameImage& image_of(const RasterizeBackwardInput& in, const PictureBatch& batch,
                                       uint32_t image) {
@@ -287,7 +294,7 @@ __device__ const PictureGradient<float>& gradient_of(const RasterizeBackwardInpu
     return in.d_picture;
 }
 
-// One block per tile. `d_background_of_tile` may be null for a batch.
+// Launched with one block per tile. `d_background_of_tile` may be null for a batch.
 template <bool kWithDepth, bool kWithSize, bool kIsBatch>
 __global__ void __launch_bounds__(kThreads, 2)
     rasterize_backward_kernel(RasterizeBackwardInput in, PictureBatch batch, GradientSlots slots,
@@ -295,8 +302,8 @@ __global__ void __launch_bounds__(kThreads, 2)
     Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
     const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
-                                 // The shuffle tells the compiler that the value is
-                                 // uniform in the warp.
+                                 // The shuffle shows the compiler that all lanes have
+                                 // the same value.
                                  0);
     const uint32_t tile = in.plans[blockIdx.x].tile;
     const uint32_t number = in.plans[blockIdx.x].image;
@@ -363,8 +370,7 @@ __global__ void __launch_bounds__(kThreads, 2)
             for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
             entries.first_pair[i] = end_pair - __popc(s.warps[i]);
         }
-        // The batch takes entries as long as there is room for their (entry, warp)
-        // pairs.
+        // Add entries to the batch while there is room for their (entry, warp) pairs.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
         blend_batch_vjp<kWithDepth, kWithSize>(s, entries, warp, num, p, warp_left + 0.5f,
                                                warp_top + 0.5f);
@@ -391,7 +397,7 @@ void start_batch(const RasterizeBackwardInput& in, const PictureBatch& batch,
 
 constexpr int kSumThreads = 256;
 
-// Adds up the gradients of the background of the tiles of each image. One block per
+// Sums the background gradients of the tiles of each image. Launched with one block per
 // image and channel.
 __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
     __shared__ float of_warp[kSumThreads / 32];

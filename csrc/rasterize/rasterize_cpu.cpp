@@ -1,4 +1,5 @@
-// Blends one tile, and computes the gradients of its records, on one CPU thread.
+// Blends one tile, and computes the gradients of its records. Runs on a single CPU
+// thread.
 
 #include "rasterize/rasterize.h"
 
@@ -74,7 +75,7 @@ static void backward(const Record<T>* records, EntryFormat format, const uint64_
         grad.d_weight[p] = d_weight;
         grad.total[p] = total + d_weight * (1 - t);
     });
-    // Distance of prefetching, in records; long enough for the data to arrive.
+    // Records are prefetched this far ahead, so that they arrive in time.
     constexpr size_t kPrefetch = 48;
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, picture.window, Extra::kNothing);

@@ -1,10 +1,11 @@
-// Blending on CUDA. A block blends a tile, front to back; its warps process sub-tiles.
+// Blending on CUDA. A block blends a tile, front to back, and its warps process
+// sub-tiles.
 //
-// A list is sorted in pieces, nearest first. Before sorting, entries that cover only
-// stopped pixels are dropped, and their records are never loaded. A list that is longer
-// than a piece is first spread over buckets of depth (spread_lists_cuda.cu). A bucket
-// that is longer than a window is spread again. If the list of a tile is much longer
-// than a block's share of all entries, several blocks blend parts of the tile
+// A list is sorted in pieces, nearest first. Before a piece is sorted, entries that
+// cover only stopped pixels are dropped without loading their records. If a list is
+// longer than a piece, it is first spread over buckets of depth (spread_lists_cuda.cu),
+// and buckets that are longer than a window are spread again. If a tile's list is much
+// longer than the average load of a block, several blocks blend parts of the tile
 // concurrently.
 
 #include "rasterize/rasterize.h"
@@ -21,24 +22,25 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-// On most multiprocessors, shared memory limits the number of blocks before the number
-// of warps does. So there are two sizes of blocks: narrow ones for multiprocessors with
-// 228 KiB of shared memory, and wide ones, in which twice as many warps share the
-// memory of a block. Both draw the same bits.
+// Shared memory usually limits how many blocks a multiprocessor runs, so there are two
+// block sizes. Narrow blocks are for multiprocessors with 228 KiB of shared memory. In
+// wide blocks, twice as many warps share the memory of a block. Both produce the same
+// bits.
 using Narrow = BlendShared<128>;
 using Wide = BlendShared<256>;
-// The number of blocks per multiprocessor for which registers suffice, without depth.
+// Number of blocks per multiprocessor that registers allow, without depth.
 template <class Shared>
 constexpr int kBlocks = 8;
 template <>
 constexpr int kBlocks<Wide> = 3;
-constexpr size_t kReservedBytes = 1024;  // of shared memory per block, for the driver
-// The average number of blocks per record from which on a lane blends two pixels. The
-// values 4, 7 and 10 differ by 1 % in time.
+constexpr size_t kReservedBytes = 1024;  // shared memory per block that the driver uses
+// If records reach more blocks than this on average, a lane blends two pixels. The
+// choice matters little: 4, 7 and 10 differ by 1 % in time.
 constexpr int kBlocksForPairs = 5;
 
 template <class Shared>
-constexpr size_t kBytes = offsetof(Shared, depth) + kReservedBytes;  // without depth
+// without the array for depth
+constexpr size_t kBytes = offsetof(Shared, depth) + kReservedBytes;
 static_assert(kBlocks<Narrow> * kBytes<Narrow> <= 228 << 10);
 
 // Returns a mask of the blocks in a part of a tile: all of it, a half or a quarter.
@@ -91,9 +93,9 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
     if (threadIdx.x < 2) s.reached[threadIdx.x] = s.num_covered[threadIdx.x] = 0;
 }
 
-// Blends the list of a tile. Returns the number of entries that were not dropped. If
-// the list is divided into windows, `window_ends` has their ends, and the list is in
-// scratch memory; otherwise `window_ends` is null.
+// Blends the list of a tile. Returns the number of entries that were not dropped.
+// `window_ends` is null, or has the ends of the windows of a list that is divided into
+// windows and stored in scratch memory.
 template <bool kWithDepth, class Stop, class Shared>
 __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
@@ -177,8 +179,8 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    // Calls visit() for the pairs of pixels that a thread initialises and writes: one
-    // pair in each of its sub-tiles.
+    // Calls visit() for each pair of pixels that this thread initialises and writes.
+    // There is one pair in each of its sub-tiles.
     using Sub = SubTile<2>;
     const auto for_each_pair = [&](const auto& visit) {
         for (int sub = warp; sub < Sub::kCount; sub += Shared::kWarps)
@@ -239,7 +241,8 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     });
 }
 
-// Fills the marked images with NaN, so that old pixels are not mistaken for new ones.
+// Fills the marked images with NaN, so that pixels of an earlier frame are not mistaken
+// for results.
 template <class Shared>
 __device__ void mark_undrawn(const FrameLists& lists) {
     for (uint32_t k = blockIdx.x; k < lists.num_marked; k += gridDim.x) {
@@ -293,7 +296,7 @@ uint32_t num_places_for() {
     return static_cast<uint32_t>(std::min<size_t>(blocks, kBlocks<Shared>)) * num_multiprocessors();
 }
 
-// Returns how many blocks the current device blends at once.
+// Returns how many blocks run concurrently on the current device.
 uint32_t num_places() {
     return has_room_for_narrow() ? num_places_for<Narrow>() : num_places_for<Wide>();
 }

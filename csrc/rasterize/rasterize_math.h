@@ -1,10 +1,10 @@
 #pragma once
 
-// Formulas for one gaussian at one pixel, or at a vector of pixels: the falloff, the
+// Formulas for one gaussian at one pixel or at a vector of pixels: the falloff, the
 // blend step, and their gradients.
 //
-// When a pixel stops, its transmittance becomes negative; the absolute value is the
-// final transmittance.
+// The sign of a transmittance marks stopped pixels: it becomes negative, and its
+// absolute value is the final transmittance.
 
 #include "frame/image.h"
 #include "math/ellipse.h"
@@ -61,7 +61,7 @@ V3DG_HD V3DG_INLINE V transmittance_behind(V alpha, V t) {
 }
 
 // Blend a gaussian over a pixel: update the transmittance `t`, and return the
-// gaussian's blend weight. Stopped pixels do not change.
+// gaussian's blend weight. Stopped pixels are not changed.
 template <class V>
 V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBehind<Lane<V>> stop) {
     const V next = transmittance_behind(alpha, t);
@@ -80,8 +80,8 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
     return weight;
 }
 
-// The factors for the final colour of a pixel: `transmittance` multiplies the
-// background, `gain` the blended colour.
+// Factors that give the final colour of a pixel: `transmittance` multiplies the
+// background, and `gain` the blended colour.
 template <class T>
 struct Finished {
     T transmittance, gain;
@@ -93,9 +93,9 @@ V3DG_HD V3DG_INLINE Finished<T> finished(T t, float min_transmittance) {
     return {has_stopped ? -t : t, T(1)};
 }
 
-// Like blend_weight(), for several gaussians, front to back. `before` receives the
-// transmittance in front of each gaussian. The common case is fast: one comparison
-// after all gaussians shows that the pixel did not stop.
+// Like blend_weight(), but blends several gaussians, front to back. `before` receives
+// the transmittance in front of each gaussian. Usually no pixel stops, and a single
+// comparison after the last gaussian shows this.
 template <int kCount, class T>
 V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&before)[kCount],
                                        T (&weight)[kCount]) {
@@ -116,13 +116,13 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
 }
 
 // Returns the gradient with respect to the exponent of a gaussian that was blended with
-// `alpha` and `weight`. `before` is the transmittance in front of the gaussian.
-// `by_weight` is the gradient with respect to its weight. `behind` is the sum of weight
+// `alpha` and `weight`. `before` is the transmittance in front of the gaussian, and
+// `by_weight` the gradient with respect to its weight. `behind` is the sum of weight
 // times by_weight over all gaussians behind it.
 template <class V>
 V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
-    // Alpha increases the gaussian's own weight, and reduces the weights of all
-    // gaussians behind it.
+    // A larger alpha increases the gaussian's own weight, and reduces the weights of
+    // all gaussians behind it.
     const V d_alpha = before * by_weight - quotient_of(behind, 1 - alpha);
     const auto moves = (weight > V{}) & (alpha < all_lanes<V>(Lane<V>(kMaxAlpha)));
     return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
@@ -132,11 +132,13 @@ V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V b
 template <class T>
 struct FalloffSums {
     T exponent, t1, t2;
-    T t1_dx, t1_dy, t2_dy;  // sums of the gradient of t1 times dx, and so on
+    T t1_dx, t1_dy, t2_dy;  // sums over pixels of the gradient of t1 times dx, of t1
+                            // times dy, and of t2 times dy
 };
 
-// Sums over the pixels of one row, which have equal dy and t2: the gradient with
-// respect to the exponent, alone and multiplied by t1 and by t1 dx.
+// Sums over the pixels of one row, in which dy and t2 are equal. They are sums of the
+// gradient with respect to the exponent, of this gradient times t1, and of it times t1
+// dx.
 template <class T>
 struct RowSums {
     T exponent, t1, t1_dx;
@@ -148,8 +150,9 @@ struct RowSums {
         t1_dx += d_t1 * f.dx;
     }
 
-    // Returns the sums of the row as input for falloff_vjp(). `f` is the falloff at any
-    // pixel of the row. The factors are -2, because the exponent contains -(t1² + t2²).
+    // Converts the sums of the row to the input of falloff_vjp(). `f` is the falloff at
+    // any pixel of the row. The factors are -2, because the exponent contains -(t1² +
+    // t2²).
     V3DG_HD V3DG_INLINE FalloffSums<T> of_falloff(const Falloff<T>& f) const {
         FalloffSums<T> sums;
         sums.exponent = exponent;
@@ -171,8 +174,8 @@ V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const 
     return {max_of(d_u, -d_u), max_of(d_v, -d_v)};
 }
 
-// Returns the gradient of the ellipse. It follows from t1 = l11 dx + l12 dy and t2 =
-// l22 dy, with dx = x - u and dy = y - v.
+// Returns the gradient of the ellipse. The formulas follow from t1 = l11 dx + l12 dy
+// and t2 = l22 dy, with dx = x - u and dy = y - v.
 template <class T>
 V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSums<T>& d) {
     Ellipse<T> out;
@@ -186,17 +189,17 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// Like blend_weight(), for a single pixel that has not stopped. Calls add(weight) if
-// the weight is positive. Returns whether the pixel goes on; `t` stays positive. On a
-// GPU, conditions as predicates are nearly free, while selecting between numbers costs
-// an instruction.
+// Like blend_weight(), but for a single pixel that has not stopped. If the weight is
+// positive, calls add(weight). Returns whether the pixel continues; `t` stays positive.
+// This form is for GPUs, where predicated branches are nearly free, but selecting
+// between two values costs an instruction.
 template <class Add>
 V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBehind<float> stop,
                                     const Add& add) {
     const float alpha = capped_alpha_of(f);
     if (contributes(f)) {
         add(alpha * t);
-        // Unlike with StopsBefore, the old value of `t` is not needed.
+        // Overwrite `t`: unlike with StopsBefore, its old value is not needed.
         t = transmittance_behind(alpha, t);
     }
     return t > stop.transmittance;
@@ -215,21 +218,21 @@ V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBefo
 }
 
 // Returns a mask of the cells that a gaussian may reach in a window of 8 x 4 cells, row
-// by row. A cell is kPixels adjacent pixels. (u, v) is the gaussian's centre relative
-// to the centre of the window's first pixel. Margins on both axes ensure that only the
-// blend step decides.
+// by row. A cell consists of kPixels adjacent pixels. (u, v) is the gaussian's centre
+// relative to the centre of the window's first pixel. The mask has a margin on both
+// axes, so that only the blend step decides about a pixel.
 template <int kPixels>
 V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, float l22,
                                       float log2_opacity) {
-    // x is in units of the window's width, so that saturating to [0, 1] clips to the
-    // window.
+    // x is divided by the window's width, so that saturating it to [0, 1] clips it to
+    // the window.
     constexpr float kScale = 0.125f / kPixels, kMargin = 1e-2f, kReachMargin = 1e-5f;
     const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha) + kReachMargin;
     const float inverse = kScale * rough_reciprocal(l11), slope = -l12 * inverse,
                 wider = inverse * (1 + 2e-3f);
-    // The range begins with the first cell whose last pixel is not left of the ellipse.
-    // It ends after the last cell whose first pixel is not right of the ellipse. Half a
-    // cell is added, because both numbers are rounded to the nearest integer later.
+    // The range begins with the first cell whose last pixel is not to the left of the
+    // ellipse. It ends with the last cell whose first pixel is not to the right of it.
+    // Both numbers are rounded to the nearest integer later, so half a cell is added.
     const float first_u = kScale * u + kScale * (1 - 0.5f * kPixels - kMargin),
                 end_u = kScale * u + kScale * (0.5f * kPixels + kMargin);
     uint32_t cells = 0;
@@ -239,8 +242,8 @@ V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, fl
         const float half = rough_sqrt(reach - t * t) * wider;
         const float first = saturated_fma(slope, y, first_u - half);
         const float end = fmaxf(saturated_fma(slope, y, end_u + half), first);
-        // For the last row, an end of 1 shifts the bit out of the word. The result 0
-        // makes the subtraction correct.
+        // In the last row, an end of 1 is shifted out of the word. The subtraction
+        // relies on the result being 0.
         const uint32_t row_begin = 1u << (8 * row);
         cells += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
     }

@@ -1,8 +1,8 @@
 #pragma once
 
-// The sensor pass: walks the lists of tiles once more, after the colours are blended,
-// and computes further channels of pixels. Among meshes, it also mixes the meshes into
-// the blended picture.
+// The sensor pass: it processes the lists of tiles again after blending, and computes
+// further channels of pixels. If the scene has meshes, it also mixes them into the
+// blended picture.
 
 #include <cstddef>
 #include <cstdint>
@@ -17,12 +17,12 @@
 
 namespace v3dg {
 
-struct SensedRecords;  // sense_math.h
+struct SensedRecords;  // defined in sense_math.h
 
-// Walks the sorted entries of one tile. `picture` has the blended pixels; with a mesh,
-// its colour, alpha and depth are changed. The planes of `sensor` begin with the first
-// pixel of the picture's window, as those of the picture do. (left, top) is the tile's
-// first pixel.
+// Processes the sorted entries of one tile. `picture` has the blended pixels; if there
+// is a mesh, their colour, alpha and depth are changed. The planes of `sensor`, like
+// those of `picture`, begin with the first pixel of the picture's window. (left, top)
+// is the tile's first pixel.
 V3DG_DECLARE_PER_ISA(void sense_tile(const Record<float>* records, const SensedRecords& sensed,
                                      EntryFormat format, const uint64_t* entry, size_t count,
                                      int left, int top, const Picture<float>& picture,
@@ -30,19 +30,19 @@ V3DG_DECLARE_PER_ISA(void sense_tile(const Record<float>* records, const SensedR
 
 namespace cuda {
 
-struct RasterTape;  // rasterize.h
+struct RasterTape;  // defined in rasterize.h
 
 // The channels and the meshes of a frame's pictures, in device memory. The channel
-// `clipped` is not supported.
+// `clipped` is not supported on CUDA.
 struct FrameSensors {
-    Sensor first;   // of the first picture
-    Sensor second;  // of the second of two eyes
-    // Number of pixels of a picture, if the planes of all pictures follow each other. 0
-    // if there are at most two pictures with planes of their own.
+    Sensor first;   // sensor of the first picture
+    Sensor second;  // sensor of the second picture of a stereo pair
+    // If all pictures share their planes, one after another: the number of pixels per
+    // picture. 0 if there are at most two pictures, each with its own planes.
     size_t num_pixels = 0;
 
     bool is_on() const { return first.is_on(); }
-    // Returns whether the channels need the normals, and the instances, of records.
+    // Returns whether the channels need the normals and the instances of records.
     bool needs_normals() const { return first.planes.normal != nullptr; }
     bool needs_instances() const { return first.planes.wants_ids(); }
     V3DG_HD Sensor of(uint32_t picture) const {
@@ -52,7 +52,8 @@ struct FrameSensors {
 };
 
 // Computes the channels of pictures that were blended with a tape, and mixes meshes
-// into them. `lists` and `tape` are those of rasterize(). Does not wait.
+// into them. Pass the same `lists` and `tape` as to rasterize(). Does not wait for the
+// device.
 void sense(const FrameLists& lists, const RasterTape& tape, const SensedRecords& records,
            const FrameSensors& sensors, Stream stream);
 

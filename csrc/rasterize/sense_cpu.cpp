@@ -1,5 +1,5 @@
 // The sensor pass over one tile, on one CPU thread. It repeats the steps of
-// blend_block() on the same numbers, front to back, so that the same gaussians
+// blend_block() front to back, with the same operations, so that the same gaussians
 // contribute with the same weights.
 
 #include "rasterize/sense.h"
@@ -10,23 +10,23 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// The sums that a tile needs.
+// Which sums a tile needs.
 struct SenseSums {
     bool median, normal, strongest, color, depth;
 };
 
-// The sums of a tile's pixels, block by block, and the meshes in them.
+// The sums of a tile's pixels, block by block, and the state of their meshes.
 struct SenseTile {
-    TilePlanes<float> blended;  // `extra` is the sum of weight times depth
+    TilePlanes<float> blended;  // `extra` holds the sum of weight times depth
     alignas(64) float normal[3][kTilePixels];
     alignas(64) float weight[kTilePixels];  // largest weight
     alignas(64) float median[kTilePixels];
-    // Part of the light that meshes in front let through.
+    // Fraction of the light that the meshes in front let through.
     alignas(64) float passes[kTilePixels];
-    // Depth of the mesh if the pixel's gaussians have not reached it, else infinite.
+    // Depth of the mesh while gaussians in front of it are blended, then infinity.
     alignas(64) float mesh_depth[kTilePixels];
     uint32_t record[kTilePixels];
-    // With meshes: the sums in front of the mesh, and the mesh.
+    // Used with meshes: the sums of the gaussians in front of the mesh, and the mesh.
     SensedSums front[kTilePixels];
     SensedMesh mesh[kTilePixels];
 };
@@ -72,7 +72,7 @@ static uint64_t start_tile(int left, int top, const Window& window, const MeshLa
     return alive;
 }
 
-// Ends the sums in front of a pixel's mesh.
+// Stores a pixel's sums up to its mesh, and starts the sums behind the mesh.
 static V3DG_INLINE void reach_mesh(const SenseSums& sums, SenseTile& tile, int p) {
     float& t = tile.blended.transmittance[p];
     SensedMesh& mesh = tile.mesh[p];
@@ -85,7 +85,7 @@ static V3DG_INLINE void reach_mesh(const SenseSums& sums, SenseTile& tile, int p
     if (mesh.coverage >= 1) t = -t;
 }
 
-// Reaches the meshes of a vector of pixels that are not behind `depth`.
+// Calls reach_mesh() for those pixels of a vector whose mesh is not behind `depth`.
 static V3DG_INLINE void reach_meshes(const SenseSums& sums, float depth, SenseTile& tile, int p) {
     using V = Vec<float>;
     const V t = load(tile.blended.transmittance + p);
@@ -116,8 +116,8 @@ static V3DG_INLINE void add_weights(const Record<float>& g, uint32_t record, con
         tile.record[p + __builtin_ctz(lanes)] = record;
 }
 
-// Blends a record over some blocks. Removes blocks from `alive` whose pixels have all
-// stopped.
+// Blends a record over some blocks. Removes blocks from `alive` if all of their pixels
+// have stopped.
 template <class Stop>
 static V3DG_INLINE void sense_record(const Record<float>& g, uint32_t record, const float* normal,
                                      uint64_t blocks, int left, int top,
@@ -168,8 +168,8 @@ static void write_channels(const SenseTile& tile, const SenseSums& sums,
     });
 }
 
-// Ends the pixels of a tile. A mesh behind all gaussians is reached now. A pixel whose
-// mesh is hidden becomes a pixel without a mesh.
+// Finishes the meshes of a tile. Meshes behind all gaussians are reached now. A pixel
+// with a hidden mesh is treated as a pixel without a mesh.
 static void end_meshes(int left, int top, const Window& window, const SenseSums& sums,
                        SenseTile& tile) {
     for_each_pixel(left, top, window, [&](int p, size_t) {
@@ -184,7 +184,7 @@ static void end_meshes(int left, int top, const Window& window, const SenseSums&
 void sense_tile(const Record<float>* records, const SensedRecords& sensed, EntryFormat format,
                 const uint64_t* entry, size_t count, int left, int top,
                 const Picture<float>& picture, const Sensor& sensor) {
-    constexpr size_t kPrefetch = 48;  // distance in records, long enough for data to arrive
+    constexpr size_t kPrefetch = 48;  // records are prefetched this far ahead
     const bool has_mesh = sensor.mesh.is_there();
     const SenseSums sums{.median = sensor.planes.median_depth != nullptr,
                          .normal = sensor.planes.normal != nullptr,

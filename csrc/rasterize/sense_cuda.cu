@@ -1,10 +1,10 @@
-// The sensor pass on CUDA: walks the lists of tiles once more after blending, in the
-// order that the tape has.
+// The sensor pass on CUDA. After blending, it processes the records of each tile again,
+// in the order stored in the tape.
 //
-// A block senses a tile, a warp 8 x 4 pixels, a thread one pixel. The block loads the
-// records of a batch while it walks the batch before. As in blending, each lane finds
-// the pixels of the warp that one of 32 records reaches, and the masks are transposed,
-// so that each pixel visits only its own records.
+// A block processes a tile, a warp 8 x 4 pixels, and a thread one pixel. The block
+// loads the next batch of records while it processes the current one. As in blending,
+// each lane finds the pixels that one of 32 records reaches. The masks are then
+// transposed, so that each pixel visits only its own records.
 
 #include "base/copy_async.cuh"
 #include "rasterize/blend_batch.cuh"
@@ -18,7 +18,7 @@ namespace {
 
 constexpr int kSenseThreads = kFrameTilePixels;
 constexpr int kSenseBlocks = 2;        // resident blocks per multiprocessor
-constexpr uint32_t kSenseBatch = 128;  // records that are loaded together
+constexpr uint32_t kSenseBatch = 128;  // number of records that are loaded together
 
 // The records of a batch.
 struct SensedBatch {
@@ -28,13 +28,13 @@ struct SensedBatch {
     uint32_t record[kSenseBatch];
 };
 
-// What a kernel computes.
+// Which outputs a kernel computes.
 template <bool kHasMeshes, bool kHasNormals>
 struct Sensing {
     static constexpr bool kMeshes = kHasMeshes, kNormals = kHasNormals;
 };
 
-// Starts to load a record into a batch.
+// Starts loading a record into a batch.
 template <class What>
 __device__ void load_sensed(const RecordPlanes& records, const SensedRecords& sensed,
                             uint32_t record, uint32_t i, SensedBatch& batch) {
@@ -48,18 +48,18 @@ __device__ void load_sensed(const RecordPlanes& records, const SensedRecords& se
 
 __device__ SensedSums no_sums() { return {{0, 0, 0}, 0, {0, 0, 0}, 0, kMeshRecord}; }
 
-// A pixel while its list is walked. Until the mesh is reached, `behind` has the sums in
-// front of it.
+// The state of a pixel. Until the mesh is reached, `sums.behind` collects the gaussians
+// in front of it.
 struct WalkedPixel {
     float x, y;  // pixel centre
     SensedPixel sums;
-    float passes;      // part of the light that the mesh lets through
-    bool awaits_mesh;  // whether the pixel has a mesh that it has not reached
-    bool is_alive;     // whether records may still change the pixel
+    float passes;      // fraction of the light that the mesh lets through
+    bool awaits_mesh;  // whether the pixel's mesh is still ahead
+    bool is_alive;     // whether more records may change the pixel
 };
 
-// Returns the mesh of a pixel. Numbers on a device are not checked, so a mesh without a
-// positive finite depth, or with NaN as coverage, is none.
+// Returns the mesh of a pixel. Values in device memory are not validated, so a mesh
+// counts as absent if its depth is not positive and finite, or if its coverage is NaN.
 __device__ SensedMesh mesh_at(const MeshLayer& layer, size_t at) {
     const float depth = layer.depth[at];
     const float coverage = layer.coverage == nullptr ? 1.0f : __saturatef(layer.coverage[at]);
@@ -82,8 +82,8 @@ __device__ void reach_mesh(WalkedPixel& pixel) {
     }
 }
 
-// Ends a pixel. If it has not reached its mesh, the mesh is behind all gaussians, or
-// hidden if the pixel has stopped.
+// Finishes a pixel whose mesh is still ahead. The mesh is behind all gaussians or, if
+// the pixel has stopped, hidden.
 __device__ void end_pixel(WalkedPixel& pixel) {
     if (pixel.awaits_mesh && pixel.sums.transmittance > 0) reach_mesh(pixel);
     if (pixel.awaits_mesh) pixel.sums.mesh.coverage = 0;
@@ -130,7 +130,8 @@ __device__ void walk_batch(const SensedBatch& batch, uint32_t count, Stop stop, 
                            float corner_y, WalkedPixel& pixel) {
     const uint32_t lane = threadIdx.x % 32;
     for (uint32_t first = 0; first < count; first += 32) {
-        // All further records are behind the mesh if the first one is.
+        // Records are ordered by depth, so if this record is behind the mesh, all later
+        // ones are.
         if (What::kMeshes && pixel.awaits_mesh && pixel.is_alive &&
             batch.rest[first].y >= pixel.sums.mesh.depth)
             reach_mesh(pixel);
@@ -153,7 +154,7 @@ __device__ void walk_batch(const SensedBatch& batch, uint32_t count, Stop stop, 
     }
 }
 
-// Walks the list of a tile. All threads of the block must call it.
+// Processes the list of a tile. All threads of the block must call it.
 template <class What, class Stop>
 __device__ void walk_list(const RecordPlanes& records, const SensedRecords& sensed,
                           const uint32_t* order, uint32_t count, Stop stop, float corner_x,
@@ -166,7 +167,8 @@ __device__ void walk_list(const RecordPlanes& records, const SensedRecords& sens
     uint32_t next = next_of(kSenseBatch);
     for (uint32_t first = 0; first < count; first += kSenseBatch) {
         wait_for_copies();
-        // All warps have left the batch that is overwritten next.
+        // This synchronisation also ensures that no warp still uses the batch that is
+        // overwritten next.
         if (!__syncthreads_or(pixel.is_alive)) break;
         const uint32_t turn = first / kSenseBatch % 2, after = first + kSenseBatch;
         if (has_record(after)) load_sensed<What>(records, sensed, next, i, batches[turn ^ 1]);
@@ -178,8 +180,8 @@ __device__ void walk_list(const RecordPlanes& records, const SensedRecords& sens
     wait_for_copies();
 }
 
-// Sets the channels of images that were not drawn, so that old pixels are not mistaken
-// for new ones.
+// Fills the channels of images that were not drawn, so that pixels of an earlier frame
+// are not mistaken for results.
 __device__ void mark_unsensed(const FrameLists& lists, const FrameSensors& sensors) {
     for (uint32_t k = blockIdx.x; k < lists.num_marked; k += gridDim.x) {
         const SensorPlanes planes = sensors.of(k).planes;
@@ -194,7 +196,7 @@ __device__ void mark_unsensed(const FrameLists& lists, const FrameSensors& senso
     }
 }
 
-// Returns the blended picture of an image, which meshes are mixed into.
+// Returns the blended picture of an image, into which meshes are mixed.
 __device__ Picture<float> picture_of(const FrameLists& lists, uint32_t k) {
     const FrameImage& image = lists.images[k];
     const PicturePlanes& planes = image.planes.color != nullptr ? image.planes : lists.planes[k];

@@ -1,13 +1,14 @@
 #pragma once
 
-// Formulas of the sensor pass for one pixel, or a vector of pixels: the sums from front
-// to back, and the channels that follow from them. rasterize_math.h has alpha and the
-// stop rules, so that weights are those of the drawn colour.
+// Formulas of the sensor pass for one pixel or a vector of pixels: the sums from front
+// to back, and the channels that are computed from them. Alpha and the stop rules are
+// those of rasterize_math.h, so the weights equal those of the blended colour.
 //
-// A mesh of coverage c at depth m divides the gaussians of a pixel into those in front,
-// whose depth is less than m, and those behind. The pixel is the mixture of c parts of
-// a picture in which the mesh hides what is behind it, and 1 - c parts of a picture
-// without the mesh. Both have the same transmittances in front of the mesh.
+// A mesh at depth m divides the gaussians of a pixel into those in front (depth less
+// than m) and those behind. A mesh with coverage c hides what is behind it in the
+// fraction c of the pixel. So the pixel is c times the picture with a mesh that hides
+// what is behind it, plus 1 - c times the picture without the mesh. Both have the same
+// transmittances in front of the mesh.
 
 #include "frame/image.h"
 #include "frame/sensor.h"
@@ -19,16 +20,17 @@
 
 namespace v3dg {
 
-// At a transmittance of at most this, half of the light is gone.
+// The median depth is where the transmittance falls to this value.
 constexpr float kMedianTransmittance = 0.5f;
 
-// These replace the index of a record for a mesh, or for nothing.
+// Special values of a record index: the mesh, and nothing.
 constexpr uint32_t kMeshRecord = ~0u;
 
-// Returns the median depth of a pixel after a gaussian. `before` is the median depth up
-// to it, 0 if there is none. `t` is the transmittance behind it; a pixel that has
-// stopped passes no light. `passes` is the part of the light that a mesh in front lets
-// through; 1 without one.
+// Returns the median depth of a pixel after a gaussian was blended. `before` is the
+// median depth without this gaussian, or 0. `t` is the transmittance behind the
+// gaussian; its sign tells whether the pixel has stopped, in which case no light
+// passes. `passes` is the fraction of light that a mesh in front lets through, 1 if
+// there is none.
 template <class V>
 V3DG_HD V3DG_INLINE V median_after(V before, V t, V passes, V depth) {
     const V left = max_of(t, V{}) * passes;
@@ -36,11 +38,11 @@ V3DG_HD V3DG_INLINE V median_after(V before, V t, V passes, V depth) {
     return is_here ? depth : before;
 }
 
-// Sums over the gaussians of a pixel that are in front of a mesh, or behind it.
+// Sums over a pixel's gaussians in front of a mesh, or behind it.
 struct SensedSums {
     float color[3], depth, normal[3];  // sums of weight times value
     float weight;                      // largest weight
-    uint32_t record;                   // the first record with this weight
+    uint32_t record;                   // first record with this weight
 };
 
 // The mesh in a pixel.
@@ -49,14 +51,14 @@ struct SensedMesh {
     float passed;  // transmittance in front of the mesh; 0 if gaussians hide the mesh
 };
 
-// Factors that make weights of sums.
+// Factors that convert the sums to final weights.
 struct SensedShares {
     float front, mesh, behind;
-    float alpha;  // opacity of gaussians and meshes
+    float alpha;  // opacity of gaussians and meshes together
 };
 
-// Returns the factors of a pixel whose list was blended. Without a mesh, or if it is
-// hidden, `mesh.coverage` is 0 and all sums are in front.
+// Returns the factors of a blended pixel. If there is no mesh, or if it is hidden,
+// `mesh.coverage` is 0 and all gaussians count as in front.
 V3DG_HD V3DG_INLINE SensedShares shares_of(float t, float min_transmittance,
                                            const SensedMesh& mesh) {
     if (mesh.coverage >= 1) return {1, mesh.passed, 0, 1};
@@ -68,10 +70,10 @@ V3DG_HD V3DG_INLINE SensedShares shares_of(float t, float min_transmittance,
             .alpha = (1 - mesh.coverage) * (1 - pixel.transmittance) + mesh.coverage};
 }
 
-// The owner of the largest weight in a pixel: a record, the mesh, or nothing.
+// What has the largest weight in a pixel: a record, the mesh, or nothing.
 struct Strongest {
     float weight;
-    uint32_t record;  // kMeshRecord: the mesh if the weight is positive
+    uint32_t record;  // kMeshRecord with a positive weight: the mesh
 };
 V3DG_HD V3DG_INLINE Strongest strongest_of(const SensedSums& front, const SensedSums& behind,
                                            const SensedShares& share) {
@@ -82,8 +84,8 @@ V3DG_HD V3DG_INLINE Strongest strongest_of(const SensedSums& front, const Sensed
     return out;
 }
 
-// Sets the blended normal of a pixel, of length 1, or 0 if there is none. `mesh_normal`
-// has any length; null: unknown.
+// Sets the blended normal of a pixel to a unit vector, or to 0 if there is none.
+// `mesh_normal` may have any length; null means that it is unknown.
 V3DG_HD V3DG_INLINE void blended_normal(const SensedSums& front, const SensedSums& behind,
                                         const float* mesh_normal, const SensedShares& share,
                                         float normal[3]) {
@@ -104,8 +106,8 @@ V3DG_HD V3DG_INLINE float blended_depth(const SensedSums& front, const SensedSum
     return share.alpha > 0 ? sum / share.alpha : 0.0f;
 }
 
-// Convert between display light (sRGB, IEC 61966-2-1) and linear light. Values above 1
-// follow the same curve, and negative values mirror it.
+// Convert between display light (sRGB, IEC 61966-2-1) and linear light. The curve is
+// extended to values above 1, and mirrored for negative values.
 V3DG_HD V3DG_INLINE float linear_of_display(float x) {
     const float a = abs_of(x);
     const float y = a <= 0.04045f ? a / 12.92f : powf((a + 0.055f) / 1.055f, 2.4f);
@@ -117,9 +119,9 @@ V3DG_HD V3DG_INLINE float display_of_linear(float x) {
     return x < 0 ? -y : y;
 }
 
-// Returns a channel of a pixel's colour, in display light. `without` is the colour of
-// the pixel without the mesh; `front` the sum of the gaussians in front; `mesh_color`
-// is in `light`, in which colours are mixed.
+// Returns one channel of a pixel's colour, in display light. `without` is the colour
+// without the mesh, and `front` the sum of the gaussians in front of it. `mesh_color`
+// is in the space `light`, in which the colours are mixed.
 V3DG_HD V3DG_INLINE float mixed_color(float without, float front, float mesh_color,
                                       const SensedMesh& mesh, MeshLight light) {
     const float c = mesh.coverage;
@@ -134,23 +136,23 @@ V3DG_HD V3DG_INLINE float mixed_color(float without, float front, float mesh_col
     return display_of_linear(c >= 1 ? with : (1 - c) * linear_of_display(without) + c * with);
 }
 
-// What records have for the sensor pass beside what blending reads. An array is null if
-// no channel needs it.
+// Additional data of records for the sensor pass. An array is null if no channel needs
+// it.
 struct SensedRecords {
     const float* normal;      // (N, 3) in view space
-    const int32_t* instance;  // (N); null: all are instance 0
-    const int32_t* label;     // per instance; null: none has a label
+    const int32_t* instance;  // (N); null: every record belongs to instance 0
+    const int32_t* label;     // per instance; null: no instance has a label
 };
 
-// A pixel whose list was blended.
+// A pixel after its list was blended.
 struct SensedPixel {
     float transmittance;  // negative if the pixel has stopped
     float median_depth;
-    SensedMesh mesh;  // coverage 0: none, or one that gaussians hide
+    SensedMesh mesh;  // coverage 0: no mesh, or a hidden one
     SensedSums front, behind;
 };
 
-// Mixes the mesh of pixel `at` into the blended picture.
+// Mixes the mesh into pixel `at` of the blended picture.
 V3DG_HD V3DG_INLINE void mix_mesh(const SensedPixel& pixel, const SensedShares& share, size_t at,
                                   const MeshLayer& layer, const Picture<float>& picture) {
     if (pixel.mesh.coverage <= 0) return;
@@ -164,7 +166,7 @@ V3DG_HD V3DG_INLINE void mix_mesh(const SensedPixel& pixel, const SensedShares& 
         picture.depth[at] = blended_depth(pixel.front, pixel.behind, pixel.mesh, share);
 }
 
-// Writes the weight and the ids of pixel `at`.
+// Writes the weight and the ids of the strongest contribution to pixel `at`.
 V3DG_HD V3DG_INLINE void write_strongest(const Strongest& strongest, size_t at,
                                          const SensedRecords& sensed, const Sensor& sensor) {
     const SensorPlanes& planes = sensor.planes;
@@ -200,9 +202,9 @@ V3DG_HD V3DG_INLINE void write_pixel(const SensedPixel& pixel, size_t at, float 
         write_strongest(strongest_of(pixel.front, pixel.behind, share), at, sensed, sensor);
 }
 
-// Sets the unit normal along an axis of a gaussian, in view space, pointing towards the
-// eye. `axis` is in model space, of any length. `p` is the gaussian's mean in view
-// space.
+// Computes the unit normal along an axis of a gaussian, in view space, pointing towards
+// the eye. `axis` is in model space, and may have any length. `p` is the gaussian's
+// mean in view space.
 V3DG_HD V3DG_INLINE void normal_along(const float axis[3], const ModelView<float>& view,
                                       const float p[3], float normal[3]) {
     for (int i = 0; i < 3; ++i)
@@ -213,8 +215,9 @@ V3DG_HD V3DG_INLINE void normal_along(const float axis[3], const ModelView<float
     for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? normal[k] * factor : 0.0f;
 }
 
-// Computes the normal of a gaussian in view space: its shortest axis, the first one of
-// equals, pointing towards the eye. `p` is the gaussian's mean in view space.
+// Computes the normal of a gaussian in view space. It is the direction of its shortest
+// axis, or of the first of equally short axes, pointing towards the eye. `p` is the
+// gaussian's mean in view space.
 V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float scale[3],
                                             const ModelView<float>& view, const float p[3],
                                             float normal[3]) {
@@ -227,26 +230,29 @@ V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float sca
     normal_along(axis, view, p, normal);
 }
 
-// Like normal_of_gaussian(), from the factor F of a PackedGaussian. If two axes are
-// equally short, the normal is any vector in their plane.
+// Like normal_of_gaussian(), but computes the normal from the factor F of a
+// PackedGaussian. If two axes are equally short, the normal is some vector in their
+// plane.
 //
-// The first column of F is the longest axis; the other two columns span the plane of
-// the other axes. Rotating these two until they are orthogonal makes them axes (a step
-// of Jacobi's method for singular values). The cross product of the two longest axes is
-// exact even if the gaussian is flat.
+// The first column of F is the longest axis, and the other two columns span the plane
+// of the other axes. They are rotated until they are orthogonal, which makes them axes;
+// this is one step of Jacobi's method for singular values. The normal is the cross
+// product of the two longest axes, which is exact even if the gaussian is flat.
 V3DG_HD V3DG_INLINE void normal_of_factor(const float f[8], const ModelView<float>& view,
                                           const float p[3], float normal[3]) {
     constexpr float kSmallest = 1e-30f;
-    // Relative to the longest axis, so that products of small scales do not vanish.
+    // Lengths are divided by the longest axis, so that products of small scales do not
+    // underflow.
     const float unit = 1 / max_of(sqrt_of(dot3(f, f)), kSmallest);
     const float one[3] = {unit * f[3], unit * f[4], unit * f[5]};
     const float other[3] = {0, unit * f[6], unit * f[7]};
     const float difference = dot3(one, one) - dot3(other, other);
     const float twice = 2 * dot3(one, other);
     // The longer axis is cosine * one + sine * other. Its squared length is largest at
-    // half the angle of (difference, twice).
+    // half the angle of the vector (difference, twice).
     const float size = sqrt_of(difference * difference + twice * twice);
-    const float cosine2 = size > 0 ? difference / size : 1.0f;  // of the double angle
+    // cosine of the double angle
+    const float cosine2 = size > 0 ? difference / size : 1.0f;
     const float cosine = sqrt_of(max_of(0.5f + 0.5f * cosine2, 0.0f));
     const float sine = sqrt_of(max_of(0.5f - 0.5f * cosine2, 0.0f)) * (twice < 0 ? -1.0f : 1.0f);
     float longest[3], middle[3], axis[3];
@@ -258,16 +264,17 @@ V3DG_HD V3DG_INLINE void normal_of_factor(const float f[8], const ModelView<floa
     normal_along(axis, view, p, normal);
 }
 
-// A gaussian that is not drawn because its mean is before the near plane, although its
-// body extends beyond that plane. In the body, the alpha in space is at least 1/255.
+// A gaussian that is not drawn because its mean is in front of the near plane, although
+// its body extends beyond that plane. The body is the region where the gaussian's alpha
+// in 3D is at least 1/255.
 struct ClippedBody {
     double mean[3];     // in view space
     double to_unit[9];  // row major; maps the body to a ball
     double reach2;      // squared radius of the ball
 };
 
-// Sets a body. `axes` has its axes in view space as columns, row major. Returns false
-// if the body does not extend beyond the near plane.
+// Sets a body. `axes` has the gaussian's axes in view space as columns of a row-major
+// matrix. Returns false if the body does not extend beyond the near plane.
 V3DG_HD V3DG_INLINE bool set_clipped_body(const double p[3], const double axes[9], double opacity,
                                           double near_depth, ClippedBody& body) {
     if (!(opacity >= kMinAlpha) || !(opacity <= 1)) return false;
@@ -284,8 +291,8 @@ V3DG_HD V3DG_INLINE bool set_clipped_body(const double p[3], const double axes[9
     return p[2] < near_depth && p[2] + sqrt(body.reach2 * across) >= near_depth;
 }
 
-// Returns whether the ray from the eye through (x, y, 1) meets a body beyond the near
-// plane.
+// Returns whether the part of a body beyond the near plane is hit by the ray from the
+// eye through (x, y, 1).
 V3DG_HD V3DG_INLINE bool meets_body(const ClippedBody& body, double x, double y,
                                     double near_depth) {
     double a[3], b[3], ab = 0, aa = 0;
@@ -296,7 +303,8 @@ V3DG_HD V3DG_INLINE bool meets_body(const ClippedBody& body, double x, double y,
         ab += a[k] * b[k];
         aa += a[k] * a[k];
     }
-    const double nearest = ab / aa;  // depth of the point that is nearest in the ball
+    const double nearest = ab / aa;  // depth of the point on the ray that is closest to
+                                     // the ball's centre
     const double depth = nearest > near_depth ? nearest : near_depth;
     double distance2 = 0;
     for (int k = 0; k < 3; ++k) distance2 += (depth * a[k] - b[k]) * (depth * a[k] - b[k]);

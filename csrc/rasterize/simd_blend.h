@@ -1,8 +1,8 @@
 #pragma once
 
-// Blends one tile on the CPU, front to back. The records of a batch are assigned to the
-// blocks that they may change. Then each block blends its records, with its pixels in
-// registers.
+// Blends one tile on the CPU, front to back. Records are processed in batches. First,
+// the records of a batch are assigned to the blocks that they may change. Then, each
+// block blends its records, with its pixels in registers.
 
 #include <cstddef>
 #include <cstring>
@@ -12,15 +12,15 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// The largest number of records in a batch. It is large enough that a block has several
-// records, and small enough that the batch fits into the L1 cache.
+// Maximum number of records in a batch. It is large enough that a block has several
+// records, and small enough that a batch fits into the L1 cache.
 constexpr int kBatchSize = 256;
-// The largest number of (record, block) pairs in a batch. With large records it keeps
-// batches short, so that fewer records are loaded that turn out to be hidden.
+// Maximum number of (record, block) pairs in a batch. It makes batches short if records
+// are large, so that fewer records are loaded that turn out to be hidden.
 constexpr int kBatchBlocks = 1024;
 
-// The first part of a record, which blending reads. The centre is in px from the tile's
-// corner.
+// The part of a record that blending reads first. The centre is relative to the tile's
+// corner, in px.
 template <class T>
 struct BatchRecord {
     T u, v, l11, l12, l22, log2_opacity;
@@ -37,8 +37,8 @@ struct BatchRecord {
     }
 };
 
-// Prefetches a record into the L2 cache, which supports more outstanding cache lines
-// than the L1 cache. A record may straddle two cache lines.
+// Prefetches a record into the L2 cache, which supports more outstanding loads than the
+// L1 cache. A record may straddle two cache lines, so both are prefetched.
 template <class T>
 V3DG_INLINE void prefetch_record(const Record<T>* record) {
     constexpr int kRead = 0, kSecondLevel = 2;
@@ -46,27 +46,29 @@ V3DG_INLINE void prefetch_record(const Record<T>* record) {
     __builtin_prefetch(reinterpret_cast<const char*>(record + 1) - 1, kRead, kSecondLevel);
 }
 
-// A batch of records of a tile, front to back, and the records of each block.
+// A batch of a tile's records, front to back, and the records of each block.
 template <class T>
 struct Batch {
     int size;
-    const Record<T>* source[1 + kBatchSize];  // index 1 is the first record
+    const Record<T>* source[1 + kBatchSize];  // element 0 is only prefetched; the
+                                              // records begin at 1
     uint64_t blocks[kBatchSize];              // blocks that each record may change
     BatchRecord<T> record[kBatchSize];
     uint16_t count[kTileBlocks * kTileBlocks];
     uint8_t place[kTileBlocks * kTileBlocks][kBatchSize];
 };
 
-// A record of a tile's list, and the blocks that its box touches.
+// A record in a tile's list, and the blocks that its box touches.
 template <class T>
 struct Listed {
     const Record<T>* record;
     uint64_t blocks;
 };
 
-// Adds records to the batch, from index i on, until it is full. Returns the index of
-// the next record. Only records whose boxes touch live blocks are added, and loaded.
-// The loop has no branch, because it would be mispredicted often.
+// Adds records to the batch until it is full, beginning with record i of the list.
+// Returns the index of the next record. Only records whose boxes touch live blocks are
+// added and loaded. The loop is branch-free, because a branch would often be
+// mispredicted.
 template <class T, class ListedAt>
 V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const ListedAt& listed_at,
                              Batch<T>& batch) {
@@ -110,7 +112,7 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     }
 }
 
-// Return the transmittance that live pixels stay above.
+// Return the transmittance below which a live pixel stops.
 template <class T>
 V3DG_INLINE T least_live(StopsBehind<T> stop) {
     return stop.transmittance;
@@ -120,7 +122,7 @@ V3DG_INLINE T least_live(StopsBefore) {
     return T(kMinTransmittance);
 }
 
-// Blends the batch over one block. Returns whether any pixel of the block goes on.
+// Blends the batch over one block. Returns whether any pixel of the block continues.
 template <class T, Extra kExtra, class Stop>
 V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels,
                              Stop stop, TilePlanes<T>& tile) {
@@ -140,21 +142,21 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
           extra = kExtra == Extra::kNothing ? V{} : load(tile.extra + p);
         unsigned live = kAllLanes & ~sign_bits_of(before);
         if (live == 0) continue;
-        // The transmittance, but 0 in stopped lanes, so that they get no weight. Their
-        // transmittance stays in `before`.
+        // Stopped lanes use a transmittance of 0, so that gaussians get no weight in
+        // them. Their actual transmittance stays in `before`.
         V t = max_of(before, V{});
         for (const uint8_t* at = place; at != end; ++at) {
             const BatchRecord<T>& g = batch.record[*at];
             const Falloff<V> f = falloff_at(
                 x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v, all_lanes<V>(g.l11),
                 all_lanes<V>(g.l12), all_lanes<V>(g.l22), all_lanes<V>(g.log2_opacity));
-            // Skip vectors without any contribution. If a vector covers a whole block,
-            // this is rare, so the test is left out.
+            // Skip vectors without any contribution. If one vector covers a whole
+            // block, this is so rare that the test costs more than it saves.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
             const V alpha = alpha_of(f), behind = transmittance_behind(alpha, t);
             V weight = alpha * t;
-            // Lanes seldom stop. If none does, which one difference shows, only the
-            // product carries over to the next record.
+            // Lanes seldom stop. If one subtraction shows that none stops, only the
+            // product is carried over to the next record.
             if (sign_bits_of(least - behind) == live) {
                 t = behind;
             } else {

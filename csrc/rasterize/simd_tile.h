@@ -3,10 +3,10 @@
 // The inner loops of blending on the CPU. They process one tile of 32 x 32 pixels,
 // which fits into the L1 cache.
 //
-// A tile has 8 x 8 blocks of 4 x 4 pixels. A 64-bit mask has a bit per block. One mask
-// has the blocks that a gaussian may touch. Another mask has the live blocks, in which
-// at least one pixel has not stopped. If the two masks do not overlap, the gaussian
-// costs only a few integer operations.
+// A tile is divided into 8 x 8 blocks of 4 x 4 pixels, so a 64-bit mask has one bit per
+// block. One mask marks the blocks that a gaussian may touch, and another the live
+// blocks, in which at least one pixel has not stopped. If the two masks do not overlap,
+// the gaussian costs only a few integer operations.
 
 #include <cstdint>
 
@@ -21,10 +21,10 @@ namespace V3DG_ISA {
 constexpr int kBlockPixels = kBlockSize * kBlockSize;
 constexpr int kTilePixels = kTileSize * kTileSize;
 
-// The optional value that is summed per pixel, besides colour and transmittance.
+// An optional value that is summed per pixel, in addition to colour and transmittance.
 enum class Extra { kNothing, kDepth, kCount };
 
-// The pixels of a tile, block by block, 16 pixels each.
+// The pixels of a tile, stored block by block with 16 pixels each.
 template <class T>
 struct TilePlanes {
     alignas(64) T transmittance[kTilePixels];
@@ -32,15 +32,15 @@ struct TilePlanes {
     alignas(64) T extra[kTilePixels];  // sum of weight * depth, or number of gaussians
 };
 
-// The gradients of a tile's pixels, as the backward pass reads them.
+// The gradients of a tile's pixels, in the layout that the backward pass reads.
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
     // Gradient with respect to the sum of weight * depth.
     alignas(64) T d_depth[kTilePixels];
     alignas(
-        // The part of the gradient with respect to a weight that is equal for all
-        // gaussians: from alpha and from the hidden background.
+        // The part of the gradient with respect to a weight that is the same for all
+        // gaussians. It comes from alpha and from the background that gaussians hide.
         64) T d_weight[kTilePixels];
     // Sum over gaussians of weight * (gradient with respect to the weight).
     alignas(64) T total[kTilePixels];
@@ -56,14 +56,14 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
-// The number of touched blocks from which on the exact test pays off. A block is drawn
-// fastest if one vector covers it.
+// From this number of touched blocks on, the exact test of the ellipse saves time.
+// Blocks are cheapest to draw if one vector covers a whole block.
 constexpr int kFewBlocks = kLanes<float> == kBlockPixels ? 9 : 5;
 
 // Returns the subset of `blocks` that the ellipse reaches. For each row of blocks, it
 // computes the extent of the ellipse in x over the rows of pixel centres, with the
-// margin of row_extent(). Values are rounded by truncation, because every instruction
-// set has a single instruction for it.
+// margin of row_extent(). Values are truncated, because every instruction set can do
+// this in one instruction.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
@@ -88,15 +88,15 @@ V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, ui
     return blocks & mask;
 }
 
-// Returns the live blocks of the tile that the record may change. Precondition: its box
-// touches the tile.
+// Returns the live blocks of the tile that the record may change. Precondition: the
+// record's box touches the tile.
 template <class T>
 V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t alive) {
     return blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
 }
 
 // Clears a tile. Returns the blocks that have a pixel inside the window. Pixels outside
-// of the window are marked as stopped.
+// the window are marked as stopped.
 template <class T>
 inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window,
                            Extra extra) {
@@ -150,9 +150,9 @@ struct BlockPixels {
 };
 
 // Computes the gradients of one record. Returns false if no pixel contributes. It
-// repeats the steps of blend_block() on the same numbers, front to back, so that the
-// same pixels contribute; before the first record, `tile` must be cleared.
-// tile.color[0] holds a running sum. Writes `size` only if kWithSize.
+// repeats the steps of blend_block() front to back, with the same operations, so that
+// the same pixels contribute. `tile` must be cleared before the first record, and
+// tile.color[0] then holds a running sum. `size` is only written if kWithSize is true.
 template <class T, bool kWithDepth, bool kWithSize = false>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
                                   const BlockPixels<T>& pixels, const TileGradient<T>& grad,

@@ -1,6 +1,6 @@
 // Plans the order in which tiles are blended, and the number of parts of each tile.
-// Spreads long lists over buckets of depth. A list is spread in place if it fits into
-// shared memory. Otherwise it is spread into scratch memory, in chunks that fit into
+// Also spreads long lists over buckets of depth. A list that fits into shared memory is
+// spread in place. A longer list is spread into scratch memory, in chunks that fit into
 // shared memory. The list of a tile with several parts is spread into windows.
 
 #include "rasterize/spread_lists_cuda.h"
@@ -27,14 +27,14 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
 
-// The rules of planning. Plans are ordered by falling load, so that no block starts a
-// long list at the end. Plans of one class are in any order: their loads differ by less
-// than half an octave.
+// The rules of planning. Plans are ordered by descending load, so that no block starts
+// a long list at the end. Loads are grouped into classes that span less than half an
+// octave; within a class, the order is arbitrary.
 //
-// If few tiles have most of the entries, as when an asset is in the middle of a
-// picture, these tiles are divided into parts. A block blends one part, and drops the
-// entries of other parts. `num_places` blocks run concurrently; no block should get
-// much more than its share of the load.
+// If a few tiles have most of the entries, they are divided into parts. This happens
+// when an asset fills only the middle of a picture. A block blends one part, and drops
+// the entries of other parts. `num_places` blocks run concurrently, and no block should
+// get much more than its share of the load.
 struct PlanRules {
     uint32_t share;
     bool has_parts;
@@ -52,9 +52,9 @@ struct PlanRules {
         const int octave = 31 - __clz(static_cast<int>(load));
         return kPlanClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
     }
-    // Returns the smallest load of plans that may have lists longer than kPiece. In the
-    // order of plans, no such plan follows a plan with a smaller load, because a part
-    // has at least half a share, and the loads of a class differ by less than half of
+    // Returns the smallest load of a plan whose list may be longer than kPiece. Plans
+    // after the first one with a smaller load have no such list: a part has at least
+    // half a share of the load, and the loads of a class differ by less than half of
     // the smallest one.
     __device__ uint32_t least_of_long() const {
         constexpr uint32_t kLongest = kPiece, kLeastOfPart = kPiece / kMostParts;
@@ -62,7 +62,7 @@ struct PlanRules {
     }
 };
 
-// Counts the plans of each class. One thread per tile.
+// Counts the plans of each class. Launched with one thread per tile.
 __global__ void __launch_bounds__(kPlanThreads)
     count_plans_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
@@ -81,7 +81,8 @@ __global__ void __launch_bounds__(kPlanThreads)
         atomicAdd(&lists.plan_counts[threadIdx.x], in_block[threadIdx.x]);
 }
 
-// Writes the plans, one thread per tile. The plans of a class are contiguous.
+// Writes the plans. Launched with one thread per tile. The plans of a class are
+// contiguous.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
     __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
@@ -93,7 +94,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
     const int log2_parts = rules.log2_parts_of(count), own_class = rules.class_of(count);
     if (threadIdx.x < kPlanClasses) in_block[threadIdx.x] = 0;
     __syncthreads();
-    // Number of plans of this class that earlier tiles of the block have taken.
+    // Number of plans of this class that belong to earlier tiles of the block.
     uint32_t before = 0;
     if (tile < lists.num_tiles) before = atomicAdd(&in_block[own_class], 1u << log2_parts);
     __syncthreads();
@@ -139,16 +140,16 @@ __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t cou
     return taken;
 }
 
-// The smallest number of entries in a window. A window consists of whole buckets, so it
-// may be longer by up to a bucket.
+// Minimum number of entries in a window. Windows consist of whole buckets, so they may
+// be longer by up to one bucket.
 constexpr uint32_t kWindowEntries = 3 * kWindow / 4;
 
 __device__ uint32_t num_window_ends(uint32_t count) {
     return (count + kWindowEntries - 1) / kWindowEntries;
 }
 
-// Returns the number of entries that a list needs if it is spread into windows: the
-// list, followed by the ends of its windows.
+// Returns the number of entries to allocate for a list that is spread into windows. The
+// ends of its windows are stored after the list.
 __device__ uint32_t room_in_windows(uint32_t count) {
     static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t),
                   "two ends of windows occupy the memory of an entry");
@@ -158,7 +159,7 @@ __device__ uint32_t room_in_windows(uint32_t count) {
 struct SpreadSpace {
     SpreadShared<kLog2Spread> even;
     uint32_t finer[1 << kLog2Spread];
-    TileEntry chunk[1];  // rest of the shared memory
+    TileEntry chunk[1];  // continues to the end of the shared memory
 };
 
 // Returns whether any bucket has more than `most` entries. bucket[b] must hold the
@@ -171,7 +172,7 @@ __device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t 
 }
 
 // Writes the ends of windows. A window ends with the bucket that contains the next
-// multiple of kWindowEntries entries.
+// multiple of kWindowEntries.
 __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t count,
                                   uint32_t* window_ends) {
     for (uint32_t w = threadIdx.x; w < num_window_ends(count); w += kSpreadThreads) {
@@ -187,9 +188,9 @@ __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], ui
 // Spreads a list into windows of whole buckets. `to` must have room for
 // room_in_windows() entries. All threads of the block must call it.
 //
-// Returns false if the list has no windows, because a bucket is too long or all entries
-// have the same rounded depth. Then windows must not be used: the order of equal depths
-// depends on where pieces begin, which differs between the parts of a tile.
+// Returns false if the list cannot be divided into windows, because a bucket is too
+// long or all entries have the same rounded depth. For such lists, the order of equal
+// depths depends on where pieces begin, and this differs between the parts of a tile.
 __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileEntry* to,
                                     SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
@@ -207,7 +208,8 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
     return has_windows;
 }
 
-// The number of entries per chunk of a list and bucket, two 16-bit counts per word.
+// The number of entries of a list per chunk and bucket. Each word holds two 16-bit
+// counts.
 struct ChunkCounts {
     uint32_t* words;
     uint32_t stride;  // words per chunk
@@ -220,10 +222,10 @@ struct ChunkCounts {
     }
 };
 
-// Like spread(), for a list that does not fit into shared memory. The list is processed
-// in chunks, so that the entries of a bucket are written contiguously. `most` entries
-// fit into shared memory: one chunk and, if there are few chunks, the counts of all
-// chunks. Otherwise each chunk is counted when it is read.
+// Like spread(), but for a list that does not fit into shared memory. The list is
+// processed in chunks, so that the entries of a bucket are written contiguously. Shared
+// memory holds `most` entries: one chunk and, if there are few chunks, the counts of
+// all chunks. If these counts do not fit, each chunk is counted when it is read.
 __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t count,
                                  uint32_t most, const Buckets& buckets, SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
@@ -259,9 +261,9 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
         place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
     }
 
-    // Returns the index in the chunk at which bucket b begins. Call it only after all
-    // entries are placed: placing them has moved of_chunk[b] from the begin of bucket b
-    // to its end, which is the begin of bucket b + 1.
+    // Returns the index in the chunk at which bucket b begins. This works only after
+    // all entries are placed, which advances of_chunk[b] from the beginning of bucket b
+    // to its end. That end is the beginning of bucket b + 1.
     const auto begin_of = [&](uint32_t b) { return b > 0 ? of_chunk[b - 1] : 0; };
     for (uint32_t k = 0; k < num_chunks; ++k) {
         const uint32_t first = k * size, last = min(first + size, count);
@@ -291,9 +293,9 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
 
 // Spreads the list of a plan's tile if it is longer than a piece. All threads of the
 // block must call it. A list of at most `most_held` entries fits into shared memory,
-// and is spread in place; a longer list is spread into scratch memory. The list of a
-// tile with several parts is spread into windows in scratch memory, once, for the first
-// part.
+// and is spread in place. A longer list is spread into scratch memory. The list of a
+// tile with several parts is spread into windows in scratch memory, once, by the block
+// of the first part.
 __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count,
                             uint32_t most_held, SpreadSpace& space) {
     static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0,
@@ -343,8 +345,8 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
     }
 }
 
-// Spreads long lists. A block claims its next plan when it starts the current one, to
-// hide the latency of the atomic operation.
+// Spreads long lists. A block claims its next plan when it starts the current one,
+// which hides the latency of the atomic operation.
 __global__ void __launch_bounds__(kSpreadThreads, 2)
     spread_kernel(FrameLists lists, uint32_t most_held, uint32_t num_places) {
     __shared__ uint32_t next_of_block;
@@ -377,9 +379,9 @@ uint32_t most_held() {
 }  // namespace
 
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places) {
-    // A tile with at least one share of the load is divided in two, and a tile with at
-    // least two shares in four. There are num_places shares, which bounds the number of
-    // plans.
+    // A tile with at least one share of the load is divided into two parts, and a tile
+    // with at least two shares into four. There are num_places shares, which limits the
+    // number of plans.
     return num_tiles + (kMostParts - 1) * num_places / 2 + 1;
 }
 

@@ -8,10 +8,10 @@ namespace v3dg {
 namespace cuda {
 
 // Plans the blending of all tiles by `num_places` concurrent blocks. Spreads each list
-// that is longer than a piece over buckets of depth, as described by its plan.
+// that is longer than a piece over buckets of depth, as its plan describes.
 void spread_lists(const FrameLists& lists, uint32_t num_places, cudaStream_t stream);
 
-// Returns the required number of plans, if `num_places` concurrent blocks may blend
+// Returns the number of plans to allocate if `num_places` concurrent blocks may blend
 // tiles in parts.
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places);
 

@@ -12,11 +12,11 @@ using EntryKey = unsigned long long;  // a TileEntry as an integer
 
 constexpr int kEntriesAtOnce = 4;  // loads in flight per thread
 
-// Buckets for the entries of a list. Their widths are equal in the bits of depths,
-// which are logarithmic over octaves and linear within an octave. If all depths are
-// equal, the widths are equal in the bits of key_order() instead.
+// Divides the entries of a list into buckets by depth. The buckets have equal widths in
+// the bits of depths, which are logarithmic over octaves and linear within an octave.
+// If all depths are equal, the widths are equal in the bits of key_order() instead.
 struct Buckets {
-    uint32_t lowest, last;  // `last`: index of the last bucket
+    uint32_t lowest, last;  // `last` is the index of the last bucket
     int shift;
     bool by_order;
 
@@ -28,7 +28,7 @@ struct Buckets {
     __device__ uint32_t of(EntryKey key) const {
         return min((max(part_of(key), lowest) - lowest) >> shift, last);
     }
-    // Returns the smallest part_of() of a key in the bucket; 0 for the first bucket.
+    // Returns the smallest part_of() of the keys of a bucket; 0 for the first bucket.
     __device__ uint32_t begin_of(uint32_t bucket) const {
         return bucket == 0 ? 0 : lowest + (bucket << shift);
     }
@@ -43,14 +43,14 @@ __device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int lo
             .by_order = by_order};
 }
 
-// Buckets for lists whose entries are concentrated in few buckets of equal width
-// (`even`). The bucket of an entry follows from its estimated rank. The estimate
-// assumes that the entries of one even bucket are uniformly distributed in it.
+// Buckets for lists with most entries in a few buckets of equal width (`even`). The
+// estimated rank of an entry determines its bucket. The estimate assumes that the
+// entries of an even bucket are uniformly distributed in it.
 struct FinerBuckets {
     Buckets even;
     const uint32_t* first;  // index of the first entry of each even bucket
     uint32_t count;         // number of entries
-    int shift;              // log2 of the ranks per bucket
+    int shift;              // log2 of the number of ranks per bucket
 
     __device__ uint32_t of(EntryKey key) const {
         const uint32_t bucket = even.of(key);
@@ -117,8 +117,9 @@ __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_
     }
 }
 
-// Returns buckets for the entries [first, last). If `roughly`, their range is estimated
-// from a sample. If `finely`, there are as many buckets as possible.
+// Returns buckets for the entries [first, last). If `roughly` is true, the range of
+// depths is estimated from a sample. If `finely` is true, there are as many buckets as
+// possible.
 template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                                 bool roughly, bool finely, SpreadShared<kLog2Buckets>& s) {
@@ -133,8 +134,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     };
     if (roughly) {
-        // One sample per thread. Such a list has at least as many entries as the block
-        // has threads.
+        // Each thread samples one entry. Such a list has at least as many entries as
+        // the block has threads.
         widen(entries[first + static_cast<uint32_t>(static_cast<unsigned long long>(last - first) *
                                                     threadIdx.x / kBlock)]);
     } else {
@@ -150,9 +151,9 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     }
     __syncthreads();
-    // The number of buckets gives about 64 entries per bucket. With few buckets,
-    // entries that are written to the same cache line more likely stay together in the
-    // cache.
+    // The number of buckets is chosen for about 64 entries per bucket. Fewer buckets
+    // make it more likely that entries written to the same cache line stay in the cache
+    // together.
     const int log2_buckets =
         finely ? kLog2Buckets
                : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
@@ -175,8 +176,8 @@ __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t
     scan_buckets<kCount, kBlock>(bucket, warp_sum);
 }
 
-// Copies the entries [first, last) into bucket order. In the end, bucket[b] is the
-// first index of the bucket after b.
+// Copies the entries [first, last) into bucket order. Afterwards, bucket[b] is the
+// index of the first entry of the bucket after b.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
                        const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {

@@ -1,5 +1,5 @@
-// Casts rays on the CPU: gaussians are projected in parallel chunks, their records are
-// sorted into tiles, and tiles are blended in parallel.
+// Casts rays on the CPU. Gaussians are projected in parallel chunks, and their records
+// are sorted into tiles. The tiles are then blended in parallel.
 
 #include "base/threads.h"
 #include "rays/rays.h"
@@ -20,16 +20,18 @@ namespace v3dg {
 namespace {
 
 constexpr uint64_t kPieceSize = 4096;
-// The largest number of chunks whose records are counted by tile, and of counters.
+// Each chunk counts its records per tile. These constants bound the number of chunks
+// and the total number of counters, and so the memory for counting.
 constexpr size_t kMostBinChunks = 64, kMostBinCounters = size_t(1) << 24;
 
-// A part of a draw.
+// A part of a draw, projected by one thread.
 struct Piece {
     size_t draw;
     uint64_t skip, count;
 };
 
-// Neighbouring pieces that are projected together, with about kPieceSize gaussians.
+// Groups neighbouring pieces into chunks of about kPieceSize gaussians. A thread
+// projects one chunk at a time.
 std::vector<std::vector<Piece>> chunks_of(const std::vector<Draw<float>>& draws) {
     std::vector<std::vector<Piece>> chunks;
     uint64_t room = 0;
@@ -60,7 +62,7 @@ AngleTable table_of(const RayGrid::Angles& angles) {
             .buckets_per_radian = angles.buckets_per_radian};
 }
 
-// The records of all chunks, in the order of the draws.
+// Concatenates the records of all chunks, in the order of the draws.
 Buffer<RayRecord> join(const std::vector<std::vector<RayRecord>>& parts, size_t& size) {
     std::vector<size_t> first(parts.size() + 1, 0);
     for (size_t c = 0; c < parts.size(); ++c) first[c + 1] = first[c] + parts[c].size();
@@ -81,8 +83,9 @@ void for_tiles(const RayRecord& record, const RayDirections& rays, const Body& b
     for (uint32_t k = 0; k < tiles.count(); ++k) body(rays.tile(tiles, k));
 }
 
-// The records of each tile, as entries: the bits of the nearest distance, which ascend
-// like it, above the index of the record.
+// The records of each tile. An entry has the bits of the record's nearest distance in
+// its upper half, and the index of the record in its lower half. Sorting entries as
+// integers therefore sorts them by distance.
 struct RayLists {
     std::vector<uint64_t> first;  // [tiles + 1]
     Buffer<uint64_t> entries;

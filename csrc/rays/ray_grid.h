@@ -1,7 +1,7 @@
 #pragma once
 
-// The directions of a sensor's rays, and the search for those in a box of directions,
-// for the host and for devices. rays.h has the owner of the memory.
+// The directions of a sensor's rays, and the search for the rays inside a box of
+// directions. Shared by host and device; RayGrid in rays.h owns the memory.
 
 #include <cstddef>
 #include <cstdint>
@@ -14,7 +14,7 @@ constexpr int kRayTileColumns = 16, kRayTileRows = 8;
 constexpr int kRayTileSize = kRayTileColumns * kRayTileRows;
 constexpr float kTurn = static_cast<float>(2 * kPi);
 
-// Ascending angles, and where to begin a search among them.
+// Angles in ascending order, with a table of buckets that shortens the search.
 struct AngleTable {
     const float* angles;
     const int32_t* first_in_bucket;  // [size + 1] buckets of equal width
@@ -28,7 +28,7 @@ struct AngleTable {
         if (value > angles[size - 1]) return size;
         const int bucket = static_cast<int>((value - first) * buckets_per_radian);
         int i = first_in_bucket[bucket < size ? bucket : size];
-        // Rounding may lead to a neighbouring bucket.
+        // Rounding may select a neighbouring bucket, so search from there.
         while (i > 0 && angles[i - 1] >= value) --i;
         while (angles[i] < value) ++i;
         return i;
@@ -41,16 +41,17 @@ struct AngleTable {
     }
 };
 
-// The rays in a box of directions: rows and columns from the first to the last. The
-// last column may exceed the number of columns; columns then go on from 0.
+// The rays inside a box of directions, as ranges of rows and columns. Both ends are
+// included. If the range wraps around, column1 exceeds the number of columns; subtract
+// that number to get the column.
 struct RayRange {
     int32_t row0, row1, column0, column1;
 
     V3DG_HD bool is_empty() const { return row0 > row1 || column0 > column1; }
 };
 
-// The tiles that a range reaches: rows and columns from the first on. The last column
-// may exceed the number of columns of tiles; columns then go on from 0.
+// The tiles that a range reaches: the first row and column of tiles, and how many
+// follow. Columns wrap around as in RayRange.
 struct RayTiles {
     int32_t row, column;
     uint32_t num_rows, num_columns;
@@ -58,14 +59,14 @@ struct RayTiles {
     V3DG_HD uint32_t count() const { return num_rows * num_columns; }
 };
 
-// The directions of the rays. In view space x is forward, y left and z up; azimuths
-// turn from x to y, and elevations are above the xy plane. The tables ascend; azimuths
-// are in [0, 2 pi), elevations in [-pi/2, pi/2].
+// The directions of the rays. In view space, x points forward, y left and z up.
+// Azimuths turn from x to y and are in [0, 2 pi). Elevations are measured from the xy
+// plane and are in [-pi/2, pi/2]. The tables are ascending.
 struct RayDirections {
     AngleTable azimuth, elevation;
     // The cosines and sines of the angles, padded with zeros to whole tiles.
     const float *azimuth_cosine, *azimuth_sine, *elevation_cosine, *elevation_sine;
-    // The column and the row of the sensor's picture for each angle.
+    // The column and the row of the sensor's picture that each angle belongs to.
     const int32_t *column_place, *row_place;
 
     V3DG_HD int num_columns() const { return azimuth.size; }
@@ -77,7 +78,7 @@ struct RayDirections {
     V3DG_HD size_t num_tiles() const { return size_t(tile_columns()) * tile_rows(); }
     V3DG_HD size_t num_rays() const { return size_t(num_columns()) * num_rows(); }
 
-    // Returns where a ray is in the planes of the picture.
+    // Returns the index of a ray in the planes of the picture.
     V3DG_HD size_t place(int row, int column) const {
         return size_t(row_place[row]) * num_columns() + column_place[column];
     }
@@ -89,7 +90,7 @@ struct RayDirections {
                        .column1 = num_columns() - 1};
         if (range.row0 > range.row1 || !(box.azimuth1 - box.azimuth0 < kTurn)) return range;
         const float turns = ::floorf(box.azimuth0 / kTurn) * kTurn;
-        // The subtraction rounds, so the margin is once more added to its results.
+        // This subtraction rounds, so the margin is added a second time.
         const float start = box.azimuth0 - turns - kDirectionMargin;
         const float end = box.azimuth1 - turns + kDirectionMargin;
         range.column0 = azimuth.first_from(start);
@@ -105,8 +106,8 @@ struct RayDirections {
         const int row = range.row0 / kRayTileRows;
         const int column = range.column0 / kRayTileColumns;
         int last = range.column1 / kRayTileColumns;
-        // Columns behind the last continue from the first tile, which may be reached
-        // twice.
+        // A range that wraps around continues at the first tile, so it may contain that
+        // tile twice.
         if (range.column1 >= num_columns())
             last = columns + (range.column1 - num_columns()) / kRayTileColumns;
         if (last > column + columns - 1) last = column + columns - 1;
@@ -124,21 +125,21 @@ struct RayDirections {
     }
 };
 
-// A gaussian that reaches rays. It fills two cache lines.
+// A gaussian that may hit rays, as it is read for blending. It fills two cache lines.
 struct alignas(64) RayRecord {
     RayShape<float> shape;
     float color[3];
-    float nearest;  // no ray has a hit in front of this distance
+    float nearest;  // no ray is hit closer than this
     RayRange range;
-    uint32_t order;  // ascends in the order of the draws; breaks ties of distances
+    uint32_t order;  // breaks ties of distances; ascends in the order of the draws
 };
 static_assert(sizeof(RayRecord) == 128, "a record fills two cache lines");
 
-// The distances between which hits count, and how rays end.
+// The distances between which hits count, and the rule for ending a ray.
 struct RayLimits {
     float nearest, farthest;
-    float spacing;            // px of a screen-space filter, in radians
-    float min_transmittance;  // a ray ends when less than this is left
+    float spacing;            // angle of a pixel of the filter, rad
+    float min_transmittance;  // a ray ends when its transmittance falls below this
 };
 
 }  // namespace v3dg

@@ -1,23 +1,24 @@
 #pragma once
 
-// A gaussian on the rays from one point: its largest value on each ray, the distance at
-// which it has that value, and the directions that it can reach.
+// Formulas for a gaussian on the rays from one point: its largest value on each ray,
+// the distance of that value, and the directions that the gaussian can reach.
 //
-// Nothing is projected or linearised. Let the gaussian have the mean p, seen from the
-// eye, the axes r_k (unit length) and the standard deviations s_k. On the ray of the
-// unit direction d, its squared Mahalanobis distance is least at a point where it is
-//   q(d) = |M p x M d|² / |M d|²  with the rows r_k / s_k of M.
-// With M a x M b = det(M) M^-T (a x b), and multiplied by (s_0 s_1 s_2)² above and
-// below, this is
-//   q(d) = sum_k (s_k r_k . (p x d))² / sum_k (s_i s_j r_k . d)²,  i and j not k,
-// which has no division by a deviation, and no difference of large numbers. The point
-// is at the distance t(d) = (M p . M d) / |M d|², which has the same factors.
+// Nothing is projected or linearised. Let p be the mean of the gaussian relative to the
+// eye, r_k its axes (of unit length) and s_k its standard deviations. Along the ray
+// with the unit direction d, the smallest squared Mahalanobis distance is
+//   q(d) = |M p x M d|² / |M d|²,  where the rows of M are r_k / s_k.
+// The identity M a x M b = det(M) M^-T (a x b) and multiplication by (s_0 s_1 s_2)²
+// above and below give
+//   q(d) = sum_k (s_k r_k . (p x d))² / sum_k (s_i s_j r_k . d)²,  i and j not k.
+// This form divides by no deviation, and subtracts no large numbers. The distance at
+// which q(d) is reached, t(d) = (M p . M d) / |M d|², uses the same terms.
 //
 // A screen-space filter becomes a filter of angles: the variance f in rad² adds f |p|²
 // to every s_k². This is exact for the projection along the direction of the mean,
-// because the sum of a covariance and a multiple of the identity projects to the sum of
-// both. The determinant of the projected covariance along the unit direction u is
-// sum_k (s_i s_j r_k . u)², a sum of positive terms. Lengths are divided by |p|.
+// because the projection of a sum is the sum of the projections, and a multiple of the
+// identity stays one. The determinant of the projected covariance along the unit
+// direction u is sum_k (s_i s_j r_k . u)², a sum of positive terms. All lengths are
+// divided by |p|.
 
 #include "math/gaussian.h"
 #include "math/solid_angle.h"
@@ -27,18 +28,18 @@
 
 namespace v3dg {
 
-// A gaussian as it is seen from the eye: the unit direction and the distance of its
-// mean, its axes, and its standard deviations in radians.
+// A gaussian as seen from the eye: the unit direction and the distance of its mean, its
+// axes, and its standard deviations in radians.
 template <class V>
 struct SeenGaussian {
     V direction[3], distance;
     V axis[3][3];
     V sigma[3];
     V log2_opacity;
-    V determinant;  // of the projected covariance, rad⁴
+    V determinant;  // determinant of the projected covariance, rad⁴
 };
 
-// Returns sum_k (s_i s_j r_k . u)² for squared deviations.
+// Returns sum_k (s_i s_j r_k . u)². The arguments are squared deviations.
 template <class V>
 V3DG_HD V3DG_INLINE V projected_determinant(const V variance[3], const V along[3]) {
     V sum = V{};
@@ -49,8 +50,8 @@ V3DG_HD V3DG_INLINE V projected_determinant(const V variance[3], const V along[3
     return sum;
 }
 
-// Returns a gaussian as it is seen from the eye. `filter_rad2` is the variance of the
-// filter; see Appearance for the other two settings.
+// Returns the gaussian as seen from the eye. `filter_rad2` is the variance of the
+// filter. Appearance explains the other two settings.
 template <class V, class T>
 V3DG_HD V3DG_INLINE SeenGaussian<V> see_gaussian(const Gaussian3d<V>& g, const ModelView<T>& view,
                                                  T filter_rad2, bool antialiased, bool is_limited) {
@@ -85,8 +86,8 @@ V3DG_HD V3DG_INLINE SeenGaussian<V> see_gaussian(const Gaussian3d<V>& g, const M
     return seen;
 }
 
-// Returns whether a gaussian can be seen at all: its determinant is positive and
-// finite, and its alpha is at least 1/255 at its mean.
+// Returns whether a gaussian can be seen at all. Its determinant must be positive and
+// finite, and its alpha at the mean at least 1/255.
 template <class V>
 V3DG_HD V3DG_INLINE auto is_visible(const SeenGaussian<V>& seen, const V& opacity) {
     const V huge = all_lanes<V>(kLargest<Lane<V>>);
@@ -95,12 +96,12 @@ V3DG_HD V3DG_INLINE auto is_visible(const SeenGaussian<V>& seen, const V& opacit
            (seen.distance > V{});
 }
 
-// A gaussian in the form that is evaluated on rays.
+// The coefficients of a gaussian for evaluating it on rays.
 template <class V>
 struct RayShape {
     V across[9];  // rows: kFalloffScale s_k (r_k x p), divided by the largest s
     V along[9];   // rows: s_i s_j r_k, divided by the largest s²
-    V range[3];   // |p| along^T along p
+    V range[3];   // |p| times the product of along^T and along p
     V log2_opacity;
 };
 
@@ -134,8 +135,8 @@ struct RayHit {
     V falloff, range;
 };
 
-// Evaluates a gaussian on the ray of a unit direction. Where the largest value is
-// behind the eye, the range is negative.
+// Evaluates a gaussian on the ray with a unit direction. If the largest value is behind
+// the eye, the range is negative.
 template <class V, class T>
 V3DG_HD V3DG_INLINE RayHit<V> hit_of(const RayShape<T>& shape, const V& x, const V& y, const V& z) {
     V above = V{}, below = V{};
@@ -152,32 +153,35 @@ V3DG_HD V3DG_INLINE RayHit<V> hit_of(const RayShape<T>& shape, const V& x, const
     return {above * inverse, forward * inverse};
 }
 
-// A box of directions: azimuths around the z axis from `azimuth0` to `azimuth1`, and
-// elevations from the xy plane, in radians. Azimuths that span a turn are all.
+// A box of directions. Azimuths go from `azimuth0` to `azimuth1` around the z axis, and
+// elevations are measured from the xy plane; all are in radians. A box that spans a
+// full turn contains every azimuth.
 template <class V>
 struct DirectionBox {
     V azimuth0, azimuth1, elevation0, elevation1;
 };
 
-// Margin of a DirectionBox for rounding, in radians and relative to its half size.
+// Margins of a DirectionBox for rounding: in radians, and relative to its half size.
 constexpr float kDirectionMargin = 4e-6f, kRelativeDirectionMargin = 1e-4f;
 
-// Returns a box that contains every direction on which q is at most reach2.
+// Returns a box that contains every direction for which q <= reach2.
 //
-// On the plane at distance 1 that touches the unit sphere at the mean's direction u,
-// with the axes e (east) and n (north), the image of the ellipsoid q = reach2 is a
-// conic. Its extent in e is where the line x = k touches it:
+// Take the plane that touches the unit sphere at u, the direction of the mean, with the
+// axes e (east) and n (north). In this plane, the image of the ellipsoid q = reach2 is
+// a conic. Its extent along e follows from the lines x = k that touch it:
 //   k = (-c S_eu ± sqrt(c² S_eu² + c S_ee (1 - c S_uu))) / (1 - c S_uu), c = reach2,
-// with the covariance S, and likewise in n. If 1 - c S_uu is not positive, the
-// ellipsoid reaches beside the eye, and the box has all directions.
+// where S is the covariance. The extent along n has the same form. If 1 - c S_uu is not
+// positive, the ellipsoid extends to the side of the eye or behind it, and the box
+// contains all directions.
 //
-// A point (x, y) of the plane has the distance cos - y sin from the z axis along u, x
-// across it, and the height sin + y cos, where sin and cos are those of u's elevation.
-// If the first of these reaches 0, the box contains a pole. Otherwise the azimuth
-// differs from that of u by at most |x| over the least of these distances, and the
-// elevation by y at most if x is 0. A point below the horizon rises with |x|: its
-// distance a from the axis grows by at most x² / 2a, and its elevation by at most |h| /
-// (h² + a²) times as much, where h is its height. The same holds above the horizon.
+// Let sin and cos be those of the elevation of u. A point (x, y) of the plane has the
+// coordinate cos - y sin away from the z axis in the direction of u, the coordinate x
+// across, and the height sin + y cos. If the first coordinate can be 0, the box
+// contains a pole. Otherwise, the azimuth differs from that of u by at most |x| over
+// the smallest first coordinate. For x = 0, the elevation differs by at most y. For x
+// != 0, a point below the horizon has a higher elevation: its distance a from the axis
+// grows by at most x² / 2a, and its elevation by at most |h| / (h² + a²) times as much,
+// where h is its height. The same holds, mirrored, above the horizon.
 template <class V>
 V3DG_HD V3DG_INLINE DirectionBox<V> directions_of(const SeenGaussian<V>& seen, const V& reach2) {
     using T = Lane<V>;
@@ -234,7 +238,7 @@ V3DG_HD V3DG_INLINE DirectionBox<V> directions_of(const SeenGaussian<V>& seen, c
     return box;
 }
 
-// Returns a lower bound on the distance of any point of the ellipsoid q <= reach2.
+// Returns a lower bound on the distance of all points of the ellipsoid q <= reach2.
 template <class V>
 V3DG_HD V3DG_INLINE V nearest_of(const SeenGaussian<V>& seen, const V& reach2) {
     using T = Lane<V>;

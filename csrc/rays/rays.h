@@ -1,12 +1,13 @@
 #pragma once
 
-// Casts the rays of a spherical sensor: rows of one elevation, columns of one azimuth,
-// all from one point. ray_math.h has the formulas, returns.h the layers of a ray.
+// Casts the rays of a spherical sensor. All rays start at one point; a row has one
+// elevation, and a column one azimuth. ray_math.h has the formulas, and returns.h finds
+// the layers along a ray.
 //
-// Gaussians are projected in parallel pieces, sorted into tiles of rays by the box of
-// directions that they can reach, and blended on each ray in the order of the distances
-// at which they have their largest values, ties by index. So the result does not depend
-// on tiles or threads.
+// Gaussians are projected in parallel, and their records are sorted into tiles of rays
+// by the box of directions that they can reach. On each ray, gaussians are blended in
+// the order of the distances at which they have their largest values. Equal distances
+// are ordered by index, so the result does not depend on tiles or threads.
 
 #include <cstdint>
 #include <vector>
@@ -19,11 +20,11 @@
 
 namespace v3dg {
 
-// The directions of a sensor's rays, in host memory.
+// The directions of a sensor's rays, stored in host memory.
 class RayGrid {
   public:
-    // `row_place` and `column_place` are the row and the column of the picture for each
-    // angle.
+    // `row_place` and `column_place` give the row and the column of the picture for
+    // each angle.
     RayGrid(Span<const double> azimuth, Span<const double> elevation, Span<const int32_t> row_place,
             Span<const int32_t> column_place);
     RayGrid(const RayGrid&) = delete;
@@ -33,7 +34,7 @@ class RayGrid {
     int num_columns() const { return directions_.num_columns(); }
     int num_rows() const { return directions_.num_rows(); }
 
-    // The arrays of a table.
+    // The storage of one AngleTable.
     struct Angles {
         std::vector<float> angles;
         std::vector<int32_t> first_in_bucket;
@@ -51,17 +52,19 @@ class RayGrid {
     RayDirections directions_;
 };
 
-// The results, one per ray, in the order of the picture. Null planes are not written.
+// The results, one per ray, in the order of the picture. A plane that is null is not
+// written.
 struct RayPlanes {
     float* color;  // [rays][3], premultiplied
     float* alpha;  // [rays]
-    float* range;  // [rays] mean distance by blend weight; 0 where nothing is hit
-    // [rays] of each return; all or none are null
+    float* range;  // [rays] mean distance, weighted by blend weights; 0 where nothing
+                   // is hit
+    // [rays] per return; either all of these pointers are null, or none is
     float *return_range[kMostReturns], *return_intensity[kMostReturns];
     ReturnRule rule;
 
     V3DG_HD bool has_returns() const { return return_range[0] != nullptr; }
-    // Returns the planes that begin at a ray.
+    // Returns the planes with their pointers advanced to `ray`.
     RayPlanes from(size_t ray) const {
         RayPlanes planes = *this;
         planes.alpha += ray;
@@ -75,32 +78,33 @@ struct RayPlanes {
     }
 };
 
-// A gaussian on one ray of a tile.
+// A gaussian's hit on one ray of a tile.
 struct TileHit {
     float range, alpha;
     uint32_t record;
 };
 
-// The memory of a thread for the rays of a tile.
+// Scratch memory that one thread uses for the rays of a tile.
 struct RayScratch {
     std::vector<TileHit> pending[kRayTileSize];
     ReturnFinder returns[kRayTileSize];
 };
 
-// Appends the records of gaussians [skip, skip + count) of a draw that reach a ray.
+// Appends a record for each gaussian in [skip, skip + count) of a draw that may hit a
+// ray.
 V3DG_DECLARE_PER_ISA(void project_to_rays(const Draw<float>& draw, uint64_t skip, uint64_t count,
                                           const RayDirections& rays, const RayLimits& limits,
                                           std::vector<RayRecord>& records))
 
-// Blends the rays of a tile. The low 32 bits of an entry are the index of a record;
-// entries ascend by the records' nearest distances.
+// Blends the rays of a tile. The low 32 bits of an entry are the index of its record.
+// Entries must be sorted by the nearest distances of their records.
 V3DG_DECLARE_PER_ISA(void cast_tile(const RayRecord* records, Span<const uint64_t> entries,
                                     const RayDirections& directions, size_t tile,
                                     const RayLimits& limits, RayScratch& scratch,
                                     const RayPlanes& planes))
 
 namespace cpu {
-// Casts all rays of a grid through gaussians.
+// Casts all rays of a grid through the gaussians of `draws`.
 void cast_rays(const std::vector<Draw<float>>& draws, const RayDirections& rays,
                const RayLimits& limits, const RayPlanes& planes);
 }  // namespace cpu

@@ -1,6 +1,6 @@
-// Projection to rays and blending of rays on the CPU. Each step of the former works on
-// a vector of gaussians, each step of the latter on a vector of rays. Compiled once per
-// instruction set.
+// Projects gaussians to rays, and blends rays, on the CPU. Projection processes a
+// vector of gaussians at once; blending processes a vector of rays. This file is
+// compiled once per instruction set.
 
 #include "rays/rays.h"
 
@@ -14,9 +14,9 @@ namespace V3DG_ISA {
 
 using V = Vec<float>;
 
-// The number of gaussians between two times at which the hits of rays are blended.
+// Hits of rays are blended each time after this number of gaussians.
 constexpr size_t kFlushed = 32;
-// How many entries ahead records are loaded into the cache.
+// Records are prefetched this many entries ahead.
 constexpr size_t kAhead = 6;
 
 static V3DG_INLINE RayShape<float> lane_of(const RayShape<V>& shape, int i) {
@@ -104,12 +104,12 @@ void project_to_rays(const Draw<float>& draw, uint64_t skip, uint64_t count,
                  });
 }
 
-// The rays of a tile while they are blended.
+// The state of a tile's rays during blending.
 struct TileRays {
     float transmittance[kRayTileSize];
     float color[kRayTileSize][3];
     float weighted_range[kRayTileSize];
-    int num_open;  // rays that have not ended
+    int num_open;  // number of rays that have not ended
 
     bool is_open(int ray) const { return transmittance[ray] > 0; }
     void close(int ray) {
@@ -118,7 +118,7 @@ struct TileRays {
     }
 };
 
-// Blends the pending hits of a ray that are in front of `end`, and keeps the others.
+// Blends a ray's pending hits that are closer than `end`, and keeps the others.
 static void blend_pending(const RayRecord* records, float end, const RayLimits& limits, int ray,
                           bool has_returns, RayScratch& scratch, TileRays& rays, float& left) {
     std::vector<TileHit>& pending = scratch.pending[ray];
@@ -145,9 +145,9 @@ static void blend_pending(const RayRecord* records, float end, const RayLimits& 
     pending.erase(pending.begin(), pending.begin() + static_cast<std::ptrdiff_t>(blended));
 }
 
-// Adds the hits of one gaussian to the rays of a row of a tile. `x`, `y` and `z` are
-// the directions of the rays. Bit k of `vectors` is set if the gaussian may reach the
-// rays of vector k.
+// Adds the hits of one gaussian to the rays of one row of a tile. `x`, `y` and `z` are
+// the directions of the rays. Bit k of `vectors` is set if the gaussian may hit rays of
+// vector k.
 static V3DG_INLINE void hit_row(const RayRecord& record, uint32_t index, const RayLimits& limits,
                                 unsigned vectors, int first_ray, const float* x, const float* y,
                                 float z, const TileRays& rays, RayScratch& scratch) {
@@ -159,7 +159,7 @@ static V3DG_INLINE void hit_row(const RayRecord& record, uint32_t index, const R
                             (hit.range <= all_lanes<V>(limits.farthest));
         unsigned bits = bits_of(is_hit);
         if (bits == 0) continue;
-        // No alpha is below 1/255, except in lanes that are not hit.
+        // Raising alpha to at least 1/255 has an effect only in lanes that are not hit.
         const V log2_alpha =
             max_of(record.shape.log2_opacity - hit.falloff, all_lanes<V>(float(kLog2MinAlpha - 1)));
         const V alpha = min_of(exp2_in_range(log2_alpha), all_lanes<V>(float(kMaxAlpha)));
@@ -170,8 +170,8 @@ static V3DG_INLINE void hit_row(const RayRecord& record, uint32_t index, const R
     }
 }
 
-// Returns the vectors of a tile's rows that have a column of the range; `column` is the
-// first of the tile.
+// Returns a mask of the vectors of a tile's row that contain a column of the range.
+// `column` is the first column of the tile.
 static V3DG_INLINE unsigned vectors_of(const RayRange& range, int column, int num_columns) {
     unsigned vectors = 0;
     for (int c = 0; c < kRayTileColumns; c += kLanes<float>) {
@@ -192,7 +192,7 @@ void cast_tile(const RayRecord* records, Span<const uint64_t> entries,
     const int num_rows = std::min(kRayTileRows, directions.num_rows() - row);
     const bool has_returns = planes.has_returns();
     TileRays rays{};
-    float left[kRayTileSize];  // transmittance of rays that have ended
+    float left[kRayTileSize];  // final transmittance of each ray
     float x[kRayTileSize], y[kRayTileSize];
     for (int r = 0; r < num_rows; ++r)
         for (int c = 0; c < kRayTileColumns; ++c) {

@@ -1,16 +1,17 @@
 // Casts rays on CUDA.
 //
-// A warp projects an item, a lane per gaussian and placement. Records and entries are
-// appended to lists by atomic counters, so their places in memory vary from run to run.
-// Results do not depend on them: entries are sorted by tile and distance, and the hits
-// of a ray by distance, ties in the order of the draws.
+// A warp projects an item; each lane projects one gaussian of one placement. Atomic
+// counters append records and entries to lists, so their order in memory varies from
+// run to run. The results do not depend on this order: entries are sorted by tile and
+// distance, the hits of a ray by distance, and hits of equal distance in the order of
+// the draws.
 //
-// A block blends a tile, a thread per ray. It reads the entries of its tile in the
-// order of the lower bounds of their distances. Each ray has a window of the nearest
-// hits that are not blended yet. A hit is blended when no later entry can have a hit in
-// front of it. If the window is full, the farthest hit is dropped, and the ray stops in
-// front of it; another pass over the entries then continues from there. So the order of
-// hits is exact, in bounded memory.
+// A block blends a tile, with one thread per ray. It reads the entries of its tile in
+// ascending order of their smallest distances. Each ray has a window that stores its
+// nearest hits that are not yet blended. A hit is blended as soon as no later entry can
+// have a closer hit. If the window is full, the farthest hit is dropped, and the ray is
+// only blended up to that hit; another pass over the entries continues from there. So
+// the order of hits is exact, although memory is bounded.
 
 #include "rays/rays_cuda.h"
 
@@ -29,25 +30,26 @@ namespace {
 
 constexpr unsigned kProjectThreads = 128, kProjectWarps = kProjectThreads / 32;
 constexpr unsigned kProjectBlocks = 4;  // resident blocks per multiprocessor
-// The most tiles of a record that its own lane writes; the warp writes those of larger
-// records together.
+// A lane writes the entries of a record with at most this many tiles. The lanes of the
+// warp share the work for larger records.
 constexpr uint32_t kFewTiles = 16;
-// Distances are coded relative to the nearest one, in the bits of floats: six bits of
-// the exponent and all of the mantissa.
+// Distances are coded relative to the smallest distance. A code consists of six bits of
+// the exponent and the whole mantissa of a float.
 constexpr unsigned kDistanceBits = 29;
 constexpr uint32_t kMostDistance = (1u << kDistanceBits) - 1;
 
-// The number of hits in the window of a ray; a power of two.
+// Number of hits in the window of a ray; a power of two.
 constexpr unsigned kWindow = 16;
-// The number of entries that a block loads at once: one per lane of a warp.
+// Number of entries that a block loads at once, one per lane of a warp.
 constexpr unsigned kLoaded = 32;
-// The rays of a warp in a tile.
+// Size of the block of rays, within a tile, that a warp blends.
 constexpr int kWarpColumns = 8, kWarpRows = 4;
 static_assert(kWarpColumns * kWarpRows == 32 && kRayTileColumns % kWarpColumns == 0 &&
                   kRayTileRows % kWarpRows == 0,
               "warps divide a tile into rectangles");
 
-// Returns the code of a distance, which ascends with it, in `bits` bits.
+// Returns the code of a distance in `bits` bits. Larger distances never have smaller
+// codes.
 V3DG_HD uint32_t code_of_distance(float distance, float nearest, unsigned bits) {
     const float x = distance > nearest ? distance : nearest;
     uint32_t of_x, of_nearest;
@@ -57,14 +59,14 @@ V3DG_HD uint32_t code_of_distance(float distance, float nearest, unsigned bits) 
     return (difference < kMostDistance ? difference : kMostDistance) >> (kDistanceBits - bits);
 }
 
-// Returns a lower bound of the distances with this code or a larger one.
+// Returns a lower bound of all distances whose code is at least `code`.
 V3DG_HD float distance_of_code(uint32_t code, float nearest, unsigned bits) {
     uint32_t of_nearest;
     std::memcpy(&of_nearest, &nearest, sizeof nearest);
     return float_of_bits(of_nearest + (code << (kDistanceBits - bits)));
 }
 
-// Reads gaussians of rows.
+// Loads gaussians that are stored as rows of floats.
 struct RowReader {
     using Model = GaussianRows<const float>;
 
@@ -92,18 +94,18 @@ struct RowReader {
     }
 };
 
-// Reads gaussians of codes.
+// Loads gaussians that are stored as quantisation codes.
 struct CodeReader {
     using Model = CodedGaussians;
 
     static __device__ bool has(const Model& m) { return m.codes.records != nullptr; }
-    // Returns the cluster of a row of the item.
+    // Returns the cluster that contains row `g` of the item.
     static __device__ uint32_t cluster_of(const Model& m, const DrawItem& item, uint32_t g) {
         uint32_t cluster = item.cluster;
         while (g >= static_cast<uint32_t>(__ldg(m.codes.offset.data + cluster + 1))) ++cluster;
         return cluster;
     }
-    // Sets the coefficients of degree 0, too.
+    // Loads a gaussian. Unlike RowReader, it also sets the SH coefficients of degree 0.
     static __device__ Gaussian3d<float> load(const Model& m, uint32_t cluster, uint32_t g,
                                              float sh[3]) {
         return CodeSource::decoded(m, cluster, CodeSource::fetch(m, g), sh);
@@ -127,14 +129,15 @@ __device__ void store_record(const RayRecord& record, RayRecord* to) {
         reinterpret_cast<float4*>(to)[k] = from[k];
 }
 
-// Returns the sum over the lanes before this one; `total` is the sum over all.
+// Returns the sum over the lower lanes of the warp. `total` receives the sum over all
+// lanes.
 __device__ uint32_t sum_before(uint32_t value, uint32_t& total) {
     const uint32_t sum = warp_prefix(value);
     total = __shfl_sync(kAllLanes, sum, 31);
     return sum - value;
 }
 
-// Returns the counts before `records` and `entries` were added, in every lane.
+// Adds to the counters, and returns their previous values in every lane.
 __device__ RayListCounts add_to(RayListCounts* counts, uint32_t records, uint32_t entries) {
     unsigned long long before = 0;
     if (threadIdx.x % 32 == 0)
@@ -143,8 +146,9 @@ __device__ RayListCounts add_to(RayListCounts* counts, uint32_t records, uint32_
     return {__shfl_sync(kAllLanes, before, 0)};
 }
 
-// Writes the entries of the lanes' records, `before` of which belong to earlier lanes.
-// All lanes of the warp must call it; a lane without a record has no tiles.
+// Writes the entries of the lanes' records. `before` is the number of entries of lower
+// lanes. All lanes of the warp must call it; a lane without a record passes an empty
+// range of tiles.
 __device__ void write_entries(const RayDirections& rays, const RayTiles& tiles, uint32_t num_tiles,
                               uint32_t first_tile, uint32_t distance, uint32_t record,
                               unsigned long long first, uint32_t before, const RayLists& out) {
@@ -250,8 +254,8 @@ __global__ void __launch_bounds__(kProjectThreads, kProjectBlocks)
     }
 }
 
-// One thread per entry, and one for the end: writes the first entry of each tile that
-// begins there.
+// Writes the index of the first entry of each tile. There is one thread per entry, and
+// one more for the end of the list.
 __global__ void first_kernel(const uint64_t* entries, uint32_t count, unsigned shift,
                              uint32_t num_tiles, uint32_t* first) {
     const uint32_t i = blockIdx.x * blockDim.x + threadIdx.x;
@@ -261,7 +265,7 @@ __global__ void first_kernel(const uint64_t* entries, uint32_t count, unsigned s
     for (uint32_t t = before; t <= tile; ++t) first[t] = i;
 }
 
-// The place of a hit in the order of a ray.
+// Position of a hit in the blending order of a ray.
 struct HitKey {
     float range;
     uint32_t order;
@@ -271,8 +275,9 @@ struct HitKey {
     }
 };
 
-// The nearest hits of the rays of a block that are not blended yet, each ray's in
-// ascending order in a ring. Neighbouring threads use neighbouring banks.
+// The windows of a block's rays. Each window is a ring buffer with the nearest hits
+// that are not yet blended, in ascending order. Neighbouring threads use neighbouring
+// banks of shared memory.
 struct Windows {
     float range[kWindow][kRayTileSize], alpha[kWindow][kRayTileSize];
     uint32_t record[kWindow][kRayTileSize];
@@ -299,7 +304,7 @@ class RayWindow {
         --size_;
     }
     __device__ void drop_farthest() { --size_; }
-    // Inserts a hit. The window is not full.
+    // Inserts a hit. Precondition: the window is not full.
     __device__ void insert(const TileHit& hit, uint32_t order) {
         unsigned k = size_;
         for (; k > 0; --k) {
@@ -325,7 +330,7 @@ class RayWindow {
     unsigned first_ = 0, size_ = 0;
 };
 
-// The light of one ray: colour and mean range, or returns.
+// The result of a ray while it is blended: either colour and mean range, or returns.
 template <bool kReturns>
 class RayLight {
   public:
@@ -361,7 +366,7 @@ class RayLight {
     float color_[3] = {0, 0, 0}, weighted_range_ = 0;
 };
 
-// One block per tile, one thread per ray.
+// Blends the rays of a tile. Launched with one block per tile and one thread per ray.
 template <bool kReturns>
 __global__ void __launch_bounds__(kRayTileSize)
     cast_kernel(RayLists lists, const uint64_t* entries, const uint32_t* first, RayDirections rays,
@@ -394,7 +399,8 @@ __global__ void __launch_bounds__(kRayTileSize)
     RayLight<kReturns> light(planes.rule);
     float transmittance = 1;
     bool is_over = !is_ray;
-    // Hits in front of `from` are blended. Hits from `limit` on wait for another pass.
+    // Hits before `from` are already blended. Hits from `limit` on are left for the
+    // next pass.
     HitKey from{-INFINITY, 0}, limit{INFINITY, ~0u};
     bool is_limited = false;
 

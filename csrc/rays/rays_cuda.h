@@ -1,7 +1,7 @@
 #pragma once
 
-// Casts rays on CUDA: the interface. The items of a frame are projected to records and
-// entries, entries are sorted, and the rays of each tile are blended.
+// Casts rays on CUDA. The items of a frame are projected to records and entries, the
+// entries are sorted, and the rays of each tile are blended.
 
 #include "base/device.h"
 #include "frame/draw_list.h"
@@ -11,31 +11,33 @@
 namespace v3dg {
 namespace cuda {
 
-// A key has kKeyBits bits above the index of a record, of which distances have at least
-// kLeastDistanceBits. So all pictures together have at most kMostRayTiles tiles.
+// A key has kKeyBits bits above the index of its record. Of these, at least
+// kLeastDistanceBits code the distance. This limits the number of tiles of all pictures
+// together to kMostRayTiles.
 constexpr unsigned kKeyBits = 32, kLeastDistanceBits = 8;
 constexpr size_t kMostRayTiles = (size_t(1) << (kKeyBits - kLeastDistanceBits)) - 1;
 
-// The gaussians of a cast. Each model is in `rows` or in `coded`, and empty in the
-// other list. An unused list is null.
+// The gaussians of a cast. A model is stored either in `rows` or in `coded`; its
+// element in the other list is empty. A list that no model uses is null.
 struct RayInput {
     const GaussianRows<const float>* rows;
     const CodedGaussians* coded;
     const Placement* placements;
     ItemList items;
-    // As in ProjectInput; may be null.
+    // as in ProjectInput; may be null
     const InstanceFactors* factors;
     uint32_t num_factors;
-    ImageCounts* image_counts;  // [images] counts to which the kernel adds
+    ImageCounts* image_counts;  // [images] the kernel adds to these counts
 
     V3DG_HD const InstanceFactors* factors_of(const DrawItem& item) const {
         return factors + item.placement % num_factors;
     }
 };
 
-// Numbers of records and entries in one integer, so that a warp counts both at once. A
-// cast of at most kMostRayGaussians gaussians has no more records than that, which
-// leaves 36 bits for the entries.
+// The numbers of records and entries are packed into one integer, so that a warp
+// updates both with one atomic operation. A cast has at most kMostRayGaussians
+// gaussians, so the records need no more than these bits. The other 36 bits count
+// entries.
 constexpr unsigned kRecordBits = 28;
 constexpr unsigned long long kMostRayGaussians = (1ull << kRecordBits) - 1;
 struct RayListCounts {
@@ -45,39 +47,41 @@ struct RayListCounts {
     V3DG_HD unsigned long long entries() const { return both >> kRecordBits; }
 };
 
-// The records that reach rays, and a key for each tile that a record reaches: from the
-// highest bits down the tile, counted over all pictures, the lower bound of its
-// distance, rounded down, and in the lowest 32 bits the index of the record. The order
-// in memory is not determined.
+// The records that may hit rays, and one key for each tile that a record reaches. From
+// the highest bit down, a key has the index of the tile (counted over all pictures),
+// the record's smallest distance, rounded down, and in the lowest 32 bits the index of
+// the record. The order of keys in memory varies from run to run.
 struct RayLists {
     RayRecord* records;
     uint64_t* entries;
-    // In device memory, initially 0. Records and entries beyond a capacity are counted,
-    // but not stored.
+    // Counters in device memory, initially 0. They also count records and entries
+    // beyond the capacities, which are not stored.
     RayListCounts* counts;
     unsigned long long record_capacity, entry_capacity;
     unsigned distance_bits;
 };
 
-// Returns the number of bits that are left for distances.
+// Returns the number of bits of a key that are left for the distance.
 unsigned distance_bits_of(size_t num_tiles);
 
-// Writes the records and entries of all items. Does nothing if items exceed a capacity.
+// Writes the records and entries of all items. Does nothing if the number of items
+// exceeds their capacity.
 void project_to_rays(const RayInput& in, const RayDirections& rays, const RayLimits& limits,
                      const RayLists& out, cudaStream_t stream);
 
-// Memory to sort entries.
+// Scratch memory for sorting entries.
 struct RaySortBuffers {
     DeviceBuffer<uint64_t> sorted;
     DeviceBuffer<unsigned char> scratch;
     DeviceBuffer<uint32_t> first;  // [tiles + 1] first entry of each tile
 };
 
-// Sorts entries, and finds the first one of each tile.
+// Sorts the entries, and finds the first entry of each tile.
 void sort_entries(const RayLists& lists, size_t num_entries, size_t num_tiles,
                   RaySortBuffers& buffers, cudaStream_t stream);
 
-// Blends the rays of `num_images` pictures, which follow each other in the planes.
+// Blends the rays of `num_images` pictures. Each plane holds the pictures one after
+// another.
 void cast_rays(const RayLists& lists, const RaySortBuffers& sorted, size_t num_images,
                const RayDirections& rays, const RayLimits& limits, const RayPlanes& planes,
                cudaStream_t stream);

@@ -1,6 +1,6 @@
 #pragma once
 
-// The returns of a pulse of light: the layers along a ray.
+// Finds the returns of a pulse of light: the layers of gaussians along a ray.
 
 #include <cmath>
 #include <cstdint>
@@ -11,38 +11,41 @@ namespace v3dg {
 
 constexpr int kMostReturns = 2;
 
-// Returns the luma of a colour: ITU-R BT.709, on the values that a picture has.
+// Returns the luma of a colour by ITU-R BT.709. The colour is not converted to linear
+// light first.
 V3DG_HD inline float luma_of(const float rgb[3]) {
     return 0.2126f * rgb[0] + 0.7152f * rgb[1] + 0.0722f * rgb[2];
 }
 
-// The light that one gaussian sends back on a ray: its distance, its blend weight, and
-// the luma of its colour. The contributions of a ray are ordered by range.
+// The light that one gaussian returns along a ray: its distance, its blend weight, and
+// the luma of its colour. Contributions are processed in ascending order of range.
 struct Contribution {
     float range, weight, luma;
 };
 
-// How layers are told apart. A layer is detected where the weights since the last layer
-// add up to at least `least_weight`. It contains these contributions, and all that
-// follow within `gap` behind that place.
+// The rule that divides contributions into layers. A layer is detected as soon as the
+// weights after the previous layer add up to at least `least_weight`. The layer
+// includes all contributions up to this one, and those that follow within the distance
+// `gap` of it.
 struct ReturnRule {
     float least_weight, gap;
 };
 
-// One layer: the range at which half of its weight is reached, and the sum of its
-// weights times luma. A layer that is not there has an infinite range.
+// One layer. `range` is the distance at which half of the layer's weight is reached, or
+// infinity if there is no layer. `intensity` is the sum of weight times luma.
 struct Return {
     float range, intensity;
 };
 
-// Finds the layers of a ray, the nearest first, from one contribution after another.
+// Finds the layers of a ray, nearest first. The contributions of the ray are added one
+// by one.
 //
-// The range of a layer is known at its end, because that is where its weight is known.
-// Until then it stores the contributions at which half of the weight may be reached:
-// those behind which at least half of the weight so far has passed, as long as less
-// than half of the light has passed that was left in front of the layer. Each of them
-// has an alpha of at least 1/255 of at least half of that light, so fewer than
-// kMostMedians are stored.
+// The range of a layer is its weighted median, which is only known when the layer ends.
+// Until then, this class stores the contributions that can still be the median. A
+// contribution is dropped once the weight up to it is less than half of the current
+// weight. No more contributions are stored once the layer has taken half of the light
+// that reached it. Each stored contribution takes at least 1/255 of at least half of
+// that light, so there are fewer than kMostMedians.
 class ReturnFinder {
   public:
     V3DG_HD void start(const ReturnRule& rule) {
@@ -51,7 +54,8 @@ class ReturnFinder {
         for (int k = 0; k < kMostReturns; ++k) found_[k] = {INFINITY, 0};
         start_layer();
     }
-    // Adds the next contribution. `transmittance` is the light in front of it.
+    // Adds the next contribution. `transmittance` is the fraction of light that reaches
+    // it.
     V3DG_HD void add(const Contribution& next, float transmittance) {
         if (num_found_ < kMostReturns && is_detected_ && !(next.range <= end_)) end_layer();
         if (num_found_ == kMostReturns) return;
@@ -72,7 +76,8 @@ class ReturnFinder {
 
   private:
     static constexpr uint32_t kMostMedians = 136;
-    // A place on the ray, and the weight of the layer up to it.
+    // A contribution that may be the median: its range, and the layer's weight up to
+    // and including it.
     struct Median {
         float passed, range;
     };
@@ -84,11 +89,14 @@ class ReturnFinder {
     }
     V3DG_HD void store(const Median& median) {
         drop_up_to(0.5f * weight_);
-        if (size_ == kMostMedians) return;  // impossible; the memory ends here
+        if (size_ == kMostMedians)
+            return;  // cannot happen; keeps writes inside the
+                     // array
         medians_[(first_ + size_) % kMostMedians] = median;
         ++size_;
     }
-    // Drops the places before which less than `half` has passed.
+    // Drops the stored contributions up to which the layer's weight is less than
+    // `half`.
     V3DG_HD void drop_up_to(float half) {
         while (size_ > 0 && medians_[first_].passed < half) {
             first_ = first_ + 1 == kMostMedians ? 0 : first_ + 1;
