@@ -74,9 +74,7 @@ struct RayDirections {
 
     V3DG_HD int num_columns() const { return azimuth.size; }
     V3DG_HD int num_rows() const { return elevation.size; }
-    V3DG_HD int tile_columns() const {
-        return (num_columns() + tile_width - 1) / tile_width;
-    }
+    V3DG_HD int tile_columns() const { return (num_columns() + tile_width - 1) / tile_width; }
     V3DG_HD int tile_rows() const { return (num_rows() + tile_height - 1) / tile_height; }
     V3DG_HD size_t num_tiles() const { return size_t(tile_columns()) * tile_rows(); }
     V3DG_HD size_t num_rays() const { return size_t(num_columns()) * num_rows(); }

@@ -261,8 +261,7 @@ V3DG_HD V3DG_INLINE V nearest_of(const SeenGaussian<V>& seen, const V& reach2) {
     const V depth = volume / sqrt_of(seen.determinant);
     const V depth2 = min_of(depth * depth, uu);  // v
     const V across2 = uu - depth2 + T(1e-5) * uu;
-    const V spread =
-        min_of(reach2 * depth2 + sqrt_of(reach2 * across2), sqrt_of(reach2 * uu));
+    const V spread = min_of(reach2 * depth2 + sqrt_of(reach2 * across2), sqrt_of(reach2 * uu));
     const V share = T(1 - 1e-5) - spread * T(1 + 1e-5);
     return max_of(share, V{}) * seen.distance;
 }
