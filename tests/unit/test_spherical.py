@@ -407,6 +407,41 @@ def test_many_hits_at_one_place_are_blended_in_order(device):
     assert np.isclose(light, layers[:, :, 2], atol=2e-3).mean() > 0.95
 
 
+@pytest.mark.parametrize("columns", [7, 400])
+def test_flat_gaussians_seen_from_the_side_are_blended_in_order(device, columns):
+    """Across a disc of a floor, the distances of the hits change by more than its
+    distance from the next disc."""
+    rng = np.random.default_rng(23)
+    count = 400
+    angles = rng.uniform(-math.pi, math.pi, count)
+    radii = rng.uniform(1, 6, count)
+    heights = np.full(count, -0.4) + rng.normal(0, 0.01, count)
+    means = np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)
+    quats = np.stack([np.ones(count), *rng.normal(0, 0.05, (3, count))], axis=1)
+    gaussians = Gaussians(
+        means=np.float32(means),
+        quats=np.float32(quats),
+        scales=np.tile(np.float32([0.5, 0.3, 0.004]), (count, 1)),
+        opacities=rng.uniform(0.05, 0.6, count).astype(np.float32),
+        sh=rng.uniform(-1, 1, (count, 1, 3)).astype(np.float32),
+    )
+    azimuth = np.linspace(-math.pi, math.pi, columns, endpoint=False)
+    lidar = Lidar(azimuth, np.linspace(-0.5, 0.1, 20), near=0.01)
+    scanned = scanned_on(device, gaussians, lidar, np.eye(4))
+    exact = reference_rays.cast(
+        gaussians, np.zeros(3), lidar.directions.reshape(-1, 3), near=lidar.near
+    )
+    assert_like(scanned.alpha, exact.alpha, exact.cutoff_distance, 1e-3)
+    layers = np.array(
+        [reference_rays.returns(ray, lidar.detection, lidar.gap) for ray in exact.contributions]
+    )
+    is_clear = exact.cutoff_distance > 1e-3
+    ranges = np.stack([scanned.range.ravel(), scanned.second_range.ravel()], axis=1)
+    assert np.isclose(ranges, layers[:, :, 0], rtol=1e-3)[is_clear].mean() > 0.97
+    light = np.stack([scanned.intensity.ravel(), scanned.second_intensity.ravel()], axis=1)
+    assert np.isclose(light, layers[:, :, 2], atol=2e-3)[is_clear].mean() > 0.97
+
+
 def test_opaque_rays_end_behind_a_small_share_of_the_light(device):
     wall = v3dg.join([dot((x, 0, 0), opacity=0.999, size=0.3) for x in (2.0, 3.0, 4.0)])
     scanned = scanned_on(device, wall, lidar_at([0.0]), np.eye(4))
