@@ -1,7 +1,7 @@
 """Level of detail for 3D Gaussian Splatting: build bundles of clusters, select a cut,
 draw it."""
 
-from v3dg import _start as _start  # first, so that commands handle Ctrl-C
+from v3dg import _start as _start  # imported first, so that commands handle Ctrl-C
 
 # isort: split
 from importlib.util import find_spec as _find_spec

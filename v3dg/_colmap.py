@@ -1,6 +1,6 @@
 """The cameras of COLMAP's models, from `cameras` and `images`, binary or text.
 
-Newer models also have `rigs` and `frames`. They are not needed, because `images`
+Newer models also have `rigs` and `frames`, which are not needed, because `images`
 contains the resulting poses. Source: COLMAP's documentation, Output Format, and its
 table of camera models.
 """
@@ -30,8 +30,8 @@ _COUNT = struct.Struct("<Q")
 _LENS = struct.Struct("<IiQQ")  # id, model, width, height
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, id of the lens
 _POINT_BYTES = 24  # x, y and the index of a 3D point
-_IMAGE_WORDS = 9  # words in a line before the name of the image
-# NaN and infinity as printed by the C libraries of Windows.
+_IMAGE_WORDS = 9  # number of words in a line before the name of the image
+# NaN and infinity as the C libraries of Windows print them.
 _WINDOWS_NOT_FINITE = re.compile(
     rb"[+-]?(?:s?nan\(\w*\)|1\.#(?:IND|INF|QNAN|SNAN)\d*)", re.IGNORECASE
 )
@@ -48,8 +48,8 @@ class _Model(NamedTuple):
             principal point follows.
         num_distortion: Number of distortion parameters, which are the last ones.
         projection: The projection of a lens without distortion.
-        terms: The terms of OpenCV's models that the parameters after the principal
-            point are; None for another model of distortion.
+        terms: The names that OpenCV uses for the parameters after the principal point.
+            None if OpenCV has no such model of distortion.
     """
 
     name: str
@@ -79,12 +79,12 @@ _MODELS = (
     _Model("EUCM", 2, 2, "pinhole"),
     _Model("EQUIRECTANGULAR", 0, 0, "sphere"),
 )
-_NUM_WIDTH_HEIGHT = 2  # EQUIRECTANGULAR has the width and the height as parameters
+_NUM_WIDTH_HEIGHT = 2  # the parameters of EQUIRECTANGULAR are width and height
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The size of an image and its lens. COLMAP calls both together a camera.
+    """The size of an image, and its lens. COLMAP calls the two together a camera.
 
     Attributes:
         distortion: The distortion parameters.
@@ -106,7 +106,7 @@ class Lens:
 
     @property
     def opencv(self) -> tuple[LensModel, tuple[float, ...]] | None:
-        """The model and the distortion of a `Camera`; None if the lens has no such
+        """The model and the distortion for `Camera`; None if `Camera` has no such
         model."""
         names: tuple[str, ...] = self.model.terms or ()
         terms = dict(zip(names, self.distortion, strict=False))
@@ -221,7 +221,7 @@ def _take(path: Path, file: IO[bytes], size: int) -> bytes:
 
 
 def _count(path: Path, file: IO[bytes], least_bytes: int) -> int:
-    """Read a number of entries; raise ValueError if the file is too short for so
+    """Read a number of entries. Raise ValueError if the file is too short to have so
     many."""
     (count,) = _COUNT.unpack(_take(path, file, _COUNT.size))
     num_bytes = os.fstat(file.fileno()).st_size
@@ -258,8 +258,8 @@ def _binary_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
 
 
 def _binary_name(path: Path, file: IO[bytes]) -> str:
-    """Read a name up to its terminating zero byte. Afterwards, the file's position is
-    behind that byte."""
+    """Read a name up to its terminating zero byte. Afterwards, the position of the file
+    is after that byte."""
     start = file.tell()
     for num_bytes in (_USUAL_NAME_BYTES, _MAX_NAME_BYTES):
         file.seek(start)
@@ -267,19 +267,23 @@ def _binary_name(path: Path, file: IO[bytes]) -> str:
         size = content.find(b"\0")
         if size >= 0:
             break
-    check(path, size >= 0, f"a name of at most {_MAX_NAME_BYTES} bytes, got a longer one")
+    check(
+        path,
+        size >= 0,
+        f"a name of at most {_MAX_NAME_BYTES} bytes, got a longer one; is the file complete?",
+    )
     file.seek(start + size + 1)
     return _text(content[:size])
 
 
 def _text(content: bytes) -> str:
-    """Decode a name in UTF-8; bytes that are not UTF-8 become escapes."""
+    """Decode a name in UTF-8. Bytes that are not UTF-8 become escapes."""
     return content.decode("utf-8", errors="backslashreplace")
 
 
 def _number(word: bytes) -> float:
-    """Return the number in a word of text; infinite numbers become NaN. Raise
-    ValueError if the word is not a number."""
+    """Convert a word of text to a number. Infinite numbers become NaN. Raise ValueError
+    if the word is not a number."""
     if _WINDOWS_NOT_FINITE.fullmatch(word):
         return math.nan
     return float(word)
@@ -332,7 +336,7 @@ def _text_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
 
 def _check_points(path: Path, numbered: tuple[int, bytes]) -> None:
     """Raise ValueError unless a line is a list of the points of an image. The line may
-    be empty, but if it were missing, the next image would be read in its place."""
+    be empty. If it were missing, the next image would be read in its place."""
     number, line = numbered
     words = line.split()
     try:

@@ -616,6 +616,8 @@ class Sensor:
     """The channels and the meshes of a request."""
 
     def __init__(self, channels: list[str], mesh: Mesh | None = None) -> None: ...
+    def of_eye(self, number: int) -> Sensor:
+        """Return the sensor with the meshes of one of two eyes."""
 
 class Picture:
     """The planes of a picture."""
@@ -781,6 +783,10 @@ class Shade:
     def __init__(
         self, *, background: Sequence[float], min_transmittance: float, with_depth: bool
     ) -> None: ...
+    @property
+    def background(self) -> Sequence[float]: ...
+    @property
+    def min_transmittance(self) -> float: ...
     @property
     def with_depth(self) -> bool: ...
 

@@ -1,4 +1,5 @@
-"""Devices: the CPU, with NumPy arrays, and CUDA devices, with torch tensors."""
+"""Devices: the CPU, with NumPy arrays, and CUDA devices, with torch tensors. Pictures
+can also be drawn by WebGPU, into NumPy arrays."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -15,11 +16,12 @@ from v3dg.gaussians import Array, Gaussians
 HostArray: TypeAlias = npt.NDArray[Any]
 
 _MUCH_MEMORY = 1 << 30
+_WEBGPU_NUMBER = -2
 
 
 @dataclass(frozen=True)
 class Device:
-    """The CPU, or a CUDA device with its index."""
+    """The CPU, a CUDA device with its index, or the device of WebGPU."""
 
     number: int = -1
 
@@ -27,14 +29,20 @@ class Device:
     def is_cuda(self) -> bool:
         return self.number >= 0
 
+    @property
+    def is_webgpu(self) -> bool:
+        return self.number == _WEBGPU_NUMBER
+
     def __str__(self) -> str:
         if self.is_cuda:
             return f"cuda:{self.number}"
+        if self.is_webgpu:
+            return "webgpu"
         return "cpu"
 
     def current(self) -> AbstractContextManager[object]:
-        """Return a context in which this is torch's current device. For the CPU, the
-        context does nothing."""
+        """Return a context in which this device is torch's current one. For the CPU,
+        the context does nothing."""
         if not self.is_cuda:
             return nullcontext()
         import torch
@@ -43,6 +51,15 @@ class Device:
 
 
 CPU = Device()
+WEBGPU = Device(_WEBGPU_NUMBER)
+
+
+def resolve_for_drawing(device: str | Device) -> Device:
+    """As `resolve`, but accept "webgpu", too. Whether it can be used shows when it
+    draws."""
+    if str(device) == "webgpu":
+        return WEBGPU
+    return resolve(device)
 
 
 def resolve(device: str | Device) -> Device:
@@ -53,10 +70,15 @@ def resolve(device: str | Device) -> Device:
 
     Raises:
         ValueError: The name is unknown.
-        RuntimeError: A CUDA device was requested and cannot be used; there is no
-            fallback to the CPU.
+        RuntimeError: A CUDA device was requested and cannot be used. The CPU is never
+            used instead.
     """
     name = str(device)
+    if name == "webgpu":
+        raise ValueError(
+            "device: 'webgpu' only draws pictures of scenes and bundles with v3dg.render, "
+            "v3dg.Renderer and `v3dg render`; use 'auto', 'cpu' or 'cuda'"
+        )
     kind, _, number = name.partition(":")
     if kind not in ("auto", "cpu", "cuda") or (
         name != kind and (kind != "cuda" or not number.isdecimal())
@@ -82,7 +104,7 @@ def resolve(device: str | Device) -> Device:
 
 
 def missing_for_cuda() -> str | None:
-    """Return the reason why CUDA cannot be used, with advice; None if it can be
+    """Return the reason why CUDA cannot be used, with advice. Return None if it can be
     used."""
     if not _core.has_cuda:
         return "v3dg was built without CUDA; install it again where nvcc is found"
@@ -111,15 +133,15 @@ def describe(device: Device) -> str:
 
 
 def of(array: Array) -> Device:
-    """Return the device of an array; a torch tensor on the host is on the CPU."""
+    """Return the device of an array. A torch tensor on the host belongs to the CPU."""
     if isinstance(array, np.ndarray) or not array.is_cuda:
         return CPU
     return Device(array.device.index)
 
 
 def place(gaussians: Gaussians, device: Device) -> Gaussians:
-    """Return the gaussians as NumPy arrays (on the CPU) or as tensors on a CUDA device,
-    without gradients."""
+    """Return gaussians without gradients, as NumPy arrays (for the CPU) or as tensors
+    on a CUDA device."""
     if not device.is_cuda:
         return gaussians.numpy()
     tensors = vars(gaussians.torch(str(device))).values()
@@ -128,8 +150,8 @@ def place(gaussians: Gaussians, device: Device) -> Gaussians:
 
 
 def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Array:
-    """Return the marked rows of an array, as a NumPy array (on the CPU) or as a CUDA
-    tensor, without gradients."""
+    """Return the marked rows of an array without gradients, as a NumPy array (for the
+    CPU) or as a CUDA tensor."""
     if isinstance(array, np.ndarray) and not device.is_cuda:
         return array[rows]
     import torch
@@ -142,7 +164,7 @@ def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Arr
 
 
 def all_like(device: Device) -> list[Device]:
-    """Return a CUDA device, followed by all others of the same model; for the CPU,
+    """Return a CUDA device, followed by all others of the same model. For the CPU,
     return only the CPU."""
     devices = [device]
     if device.is_cuda:
@@ -154,7 +176,7 @@ def all_like(device: Device) -> list[Device]:
 
 def library_of(array: Array) -> ModuleType:
     """Return the module numpy or torch, depending on the type of an array. Many
-    functions have the same names and arguments in both."""
+    functions have the same name and arguments in both."""
     if isinstance(array, np.ndarray):
         return np
     import torch
@@ -171,8 +193,8 @@ def to_host(array: Array) -> HostArray:
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Convert torch's error for too little device memory to MemoryError, as in the
-    core."""
+    """Convert torch's error for too little device memory to MemoryError, as the core
+    does."""
     try:
         yield
     except RuntimeError as error:
@@ -193,8 +215,8 @@ def own_stream(device: Device) -> AbstractContextManager[object]:
 
 
 def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], None]:
-    """Return a function that does the work on the current stream of the calling thread,
-    whichever thread runs the function."""
+    """Return a function that does the work on the stream that is current now in this
+    thread. Any thread may run the function."""
     if not device.is_cuda:
         return work
     import torch
@@ -209,7 +231,7 @@ def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], N
 
 
 def spare_memory(device: Device) -> None:
-    """Make torch release its unused cached memory on a device if it is large, because
+    """If torch caches much unused memory on a device, make torch release it, because
     the core cannot use that memory."""
     if not device.is_cuda:
         return

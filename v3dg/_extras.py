@@ -1,4 +1,4 @@
-"""Optional packages: the purpose of each, and how to install it."""
+"""Optional packages: what each is needed for, and how to install it."""
 
 import importlib
 from types import ModuleType
@@ -23,13 +23,14 @@ EXTRAS = {
     "gymnasium": Extra("gymnasium>=1.1", "environments of Gymnasium"),
     "mujoco": Extra("mujoco>=3.2", "MuJoCo"),
     "newton": Extra("newton>=1.8", "Newton"),
+    "wgpu": Extra("wgpu>=0.32", "pictures by WebGPU"),
     "distributed": Extra("distributed>=2024.1", "builds on many machines"),
 }
 """Optional packages, by the names of their modules."""
 
 
 def missing(module: str) -> str:
-    """Return the error message for a package that is missing or too old."""
+    """Return the error text for a package that is missing or too old."""
     extra = EXTRAS[module]
     packages = [package for package in EXTRAS.values() if package.purpose == extra.purpose]
     needed = " ".join(f"'{package.requirement}'" for package in packages)
@@ -40,7 +41,10 @@ def missing(module: str) -> str:
 
 
 def load(module: str) -> ModuleType:
-    """Import a module; the ImportError says how to install its package."""
+    """Import a module.
+
+    If it is missing, the ImportError says how to install its package.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -2,7 +2,8 @@
 locks.
 
 Windows lacks much of POSIX: reads at offsets, permissions, open folders, and moving a
-file that is open. All differences between systems are in this module and in `_system`.
+file that is open. All code that depends on the system is in this module and in
+`_system`.
 """
 
 import contextlib
@@ -31,25 +32,30 @@ except ImportError:
 _PIECE_BYTES = 16 << 20
 _MASK_LOCK = threading.Lock()
 _POSITION_LOCK = threading.Lock()
-# The offset of the byte that a lock on Windows covers. Others cannot read a locked
-# byte, so it is behind every content, and below the largest offset of file systems.
+# The offset of the byte that a lock on Windows covers. Other processes cannot read a
+# locked byte, so it is beyond any content, but below the largest offset of file
+# systems.
 _LOCKED_BYTE = 1 << 43
 
 PLAIN = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-"""Flags of every `os.open`: child processes do not inherit the file, and Windows
-converts no line ends."""
+"""Flags of every `os.open`. With them, child processes do not inherit the file, and
+Windows does not convert line ends."""
 
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-"""Flag of `os.open`: fail for a symbolic link. Windows follows it."""
+"""Flag of `os.open`: fail for a symbolic link.
+
+Windows has no such flag and follows the link.
+"""
 
 NO_WAIT = getattr(os, "O_NONBLOCK", 0)
-"""Flag of `os.open`: opening a pipe does not wait for its other end. The flag has no
-effect on regular files."""
+"""Flag of `os.open`: opening a pipe does not wait for its other end. For regular files,
+the flag has no effect."""
 
 OPEN_SAFELY = NO_LINK | NO_WAIT | PLAIN
 
 HAS_FOLDER_DESCRIPTORS = os.open in os.supports_dir_fd and hasattr(os, "O_DIRECTORY")
-"""Whether the system opens folders, and names files relative to an open folder."""
+"""Whether the system can open folders, and can find files relative to an open
+folder."""
 
 _FLUSHED_MODE = "rb"
 if fcntl is None:
@@ -60,13 +66,13 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | PLAIN
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
-    """Yield the name of an empty file beside `path`. The file replaces `path` at the
-    end, or is removed on failure.
+    """Yield the name of an empty file next to `path`. At the end, the file replaces
+    `path`; after an error, it is removed.
 
     The content is on the disk before the file gets its final name. The file gets the
-    permissions of the file that it replaces, and the owner and group if the system
-    allows it. If `path` is a link, it stays a link and its target is replaced; a link
-    at the temporary name is not followed.
+    permissions of the file that it replaces and, if the system allows it, the owner and
+    group. If `path` is a link, its target is replaced. A link at the temporary name is
+    not followed.
 
     Raises:
         IsADirectoryError: `path` is a folder.
@@ -74,16 +80,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
         ValueError: `path` is a device or a pipe.
         OSError: Writing failed; the error names `path`.
     """
-    # Raises for integers, which open() would accept as file descriptors.
+    # This raises for integers, which open() would accept as file descriptors.
     path = os.fspath(path)
     status_of_replaced(path)
     folder, name = os.path.split(os.path.realpath(path))
-    # The temporary name contains at most 40 characters of the name: names are limited
-    # to 255 bytes, and a character has up to four bytes.
+    # The temporary name contains at most 40 characters of the name, because names are
+    # limited to 255 bytes, and a character has up to four bytes.
     temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
-        # The file is private until it gets the permissions of the file that it
-        # replaces.
+        # Only this user may read the file, until it gets the permissions of the file
+        # that it replaces.
         os.close(os.open(temporary, _NEW_FILE, 0o600))
         try:
             yield temporary
@@ -95,11 +101,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
 
 
 def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Flush a private file to the disk and move it to `path`, with the permissions of
-    the replaced file."""
+    """Flush a private file to the disk, and move it to `path`. It gets the permissions
+    of the file that it replaces."""
     replaced = status_of_replaced(path)
     with naming_errors(path, os.fspath(private)):
-        # Windows flushes only files that may be written.
+        # Windows only flushes files that are open for writing.
         with open(private, _FLUSHED_MODE) as file:
             if hasattr(os, "fchown"):
                 _set_permissions(file.fileno(), replaced)
@@ -108,8 +114,8 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
 
 
 def _set_permissions(descriptor: int, replaced: os.stat_result | None) -> None:
-    """Give a file the permissions, owner and group of the file that it replaces, or the
-    permissions of a new file."""
+    """Set the permissions, owner and group of a file to those of the file that it
+    replaces. Without one, set the permissions of a new file."""
     if replaced is None:
         os.fchmod(descriptor, 0o666 & ~file_mode_mask())
         return
@@ -128,7 +134,7 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
         match = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
         if match:
             return int(match[1], 8)
-    # Without /proc, the umask can be read only by setting it. Files that other threads
+    # Without /proc, the umask can only be read by setting it. Files that other threads
     # create at that moment are private.
     with _MASK_LOCK:
         mask = os.umask(0o077)
@@ -137,8 +143,8 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
 
 
 def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
-    """Return the status of the file that will be replaced; None if it does not exist.
-    Raises the errors of `replacing`."""
+    """Return the status of the file that will be replaced, or None if it does not
+    exist. Raise the errors of `replacing`."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -150,16 +156,15 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
         stat.S_ISREG(status.st_mode),
         "the path of a file, got a device or a pipe; choose another path",
     )
-    # Renaming checks only the permissions of the folder. Opening the file checks the
-    # permissions of the file itself.
+    # Renaming only checks the permissions of the folder. Opening the file checks those
+    # of the file itself.
     os.close(os.open(path, os.O_WRONLY | PLAIN))
     return status
 
 
 @contextlib.contextmanager
 def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -> Iterator[None]:
-    """Add `path` to system errors that contain no file name, or contain
-    `other_name`."""
+    """Add `path` to system errors that have no file name, or that have `other_name`."""
     try:
         yield
     except OSError as error:
@@ -194,19 +199,19 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
 
 
 def start_flush(descriptor: int, offset: int, num_bytes: int) -> None:
-    """Make the system begin to write a part of a file to the disk, without waiting.
+    """Make the system start writing a part of a file to the disk, without waiting.
 
-    Otherwise Linux begins only when much data is waiting, and a flush at the end takes
-    long.
+    Otherwise, Linux starts only when much data is waiting, and the flush at the end
+    takes long.
     """
-    # On Linux this call also drops cached data that is already on the disk. New data is
-    # not on the disk yet, so it stays in the cache.
+    # On Linux, this call also drops cached data that is already on the disk. New data
+    # is not on the disk yet, so it stays in the cache.
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(descriptor, offset, num_bytes, os.POSIX_FADV_DONTNEED)
 
 
 def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
-    """Fill an array with the bytes of a file at an offset; return False if the file is
+    """Fill an array with the bytes of a file at an offset. Return False if the file is
     too short."""
     view = out.reshape(-1).view(np.uint8).data
     while view:
@@ -219,7 +224,10 @@ def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
 
 
 def read_bytes_at(descriptor: int, num_bytes: int, offset: int) -> bytes:
-    """Return at most `num_bytes` bytes of a file at an offset; fewer at its end."""
+    """Return up to `num_bytes` bytes of a file at an offset.
+
+    There are fewer at the end of the file.
+    """
     out = bytearray(num_bytes)
     count = _read_some(descriptor, memoryview(out), offset)
     return bytes(out[:count])
@@ -228,7 +236,7 @@ def read_bytes_at(descriptor: int, num_bytes: int, offset: int) -> bytes:
 def _read_some(descriptor: int, out: memoryview, offset: int) -> int:
     if hasattr(os, "preadv"):
         return os.preadv(descriptor, [out], offset)
-    # The position belongs to the open file, so only one thread may use it.
+    # Reading moves the position of the open file, so only one thread may do it.
     with _POSITION_LOCK:
         os.lseek(descriptor, offset, os.SEEK_SET)
         data = os.read(descriptor, len(out))
@@ -263,8 +271,8 @@ def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> 
     except BlockingIOError:
         raise RuntimeError(busy) from None
     except OSError as error:
-        # Some network file systems have no locks; users must not start two builds with
-        # the same output there.
+        # Some network file systems do not support locks. Users must not start two
+        # builds with the same output there.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
             raise
 
@@ -275,8 +283,8 @@ def locked_folder(
 ) -> Iterator[None]:
     """Lock a folder against other processes that do the same work. Errors name `path`.
 
-    Where folders cannot be opened, the lock is a file in the system's folder of
-    temporary files, so it holds against other processes of the same user.
+    Where folders cannot be opened, the lock is a file in the system's folder for
+    temporary files. It only excludes other processes of the same user.
     """
     if HAS_FOLDER_DESCRIPTORS:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | NO_LINK | PLAIN)
@@ -293,19 +301,19 @@ def locked_folder(
 
 
 def close_to_move(file: FileIO) -> None:
-    """Close a file that is moved or removed next, on systems that refuse to move open
-    files. The lock of the file ends."""
+    """Close a file that is moved or removed next, on systems that cannot move open
+    files. This also unlocks the file."""
     if fcntl is None:
         file.close()
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:
-    """Create the folder of an output file and the folders above it, if they do not
+    """Create the folder of an output file, and the folders above it, if they do not
     exist.
 
     Raises:
-        OSError: The folder cannot be created. NotADirectoryError: part of the path is a
-            file.
+        OSError: The folder cannot be created. It is NotADirectoryError if a part of the
+            path is a file.
     """
     folder = Path(path).parent
     try:
@@ -317,8 +325,8 @@ def make_folder(path: str | os.PathLike[str]) -> None:
 
 
 def check_bundle_name(path: str | os.PathLike[str]) -> None:
-    """Raise ValueError for a file name that `v3dg.open` would not recognise as that of
-    a bundle."""
+    """Raise ValueError for a file name that `v3dg.open` would not recognise as the name
+    of a bundle."""
     check(
         path,
         Path(path).suffix == ".v3dg",
@@ -327,7 +335,7 @@ def check_bundle_name(path: str | os.PathLike[str]) -> None:
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:
-    """Open a file for reading and return its descriptor; raise ValueError for a
+    """Open a file for reading, and return its descriptor. Raise ValueError for a
     directory, a device or a pipe."""
     descriptor = os.open(path, os.O_RDONLY | NO_WAIT | PLAIN)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):

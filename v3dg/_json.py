@@ -1,5 +1,5 @@
-"""Reads and writes strict JSON; values know their location in the file, for error
-messages."""
+"""Reads and writes strict JSON. Values are stored with their location in the file, for
+error messages."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from v3dg import _files
 T = TypeVar("T")
 
 Json: TypeAlias = Any
-"""A JSON value. It is not a union, which would make every use of a field a type error;
-`Node` checks values that are read from a file."""
+"""A JSON value. The type is not a union, which would make every use of a field a type
+error. `Node` checks values that are read from a file."""
 
 JsonObject: TypeAlias = dict[str, Json]
 
@@ -28,7 +28,7 @@ _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def parse_json(text: str | bytes) -> Json:
-    """Parse strict JSON, with or without a byte order mark; raise ValueError for
+    """Parse strict JSON, with or without a byte order mark. Raise ValueError for
     invalid JSON, NaN, repeated keys, and deep nesting."""
     if isinstance(text, bytes):
         text = text.decode("utf-8")
@@ -71,13 +71,13 @@ def json_text(value: object) -> str:
 
 
 def is_one_line(text: str) -> bool:
-    """Return whether a text fits in one line of a message: it has no control characters
-    and no unpaired surrogates."""
+    """Return whether a text fits in one line of a message. It must not have control
+    characters or unpaired surrogates."""
     return not any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in text)
 
 
 def read_json(path: str | os.PathLike[str]) -> Node:
-    """Read a JSON file; raise ValueError unless it is a regular file with strict JSON
+    """Read a JSON file. Raise ValueError unless it is a regular file with strict JSON
     in UTF-8."""
     path = Path(path)
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
@@ -93,8 +93,7 @@ def read_json(path: str | os.PathLike[str]) -> Node:
 
 
 def write_json(path: str | os.PathLike[str], document: object) -> None:
-    """Write a JSON file. An existing file is replaced only after the new one is
-    complete."""
+    """Write a JSON file. An existing file is replaced when the new one is complete."""
     with _files.replacing(path) as temporary:
         Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
@@ -109,7 +108,7 @@ class Node:
         self.path = path
 
     def problem(self, text: str) -> ValueError:
-        """Return an error that begins with the location."""
+        """Return an error whose message begins with the location."""
         return ValueError(f"{self.file}: {self.path or 'top level'}: {text}")
 
     def error(self, expected: str, advice: str = "") -> ValueError:
@@ -119,8 +118,8 @@ class Node:
         return self.problem(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
-        """Return the result of ``make``. ValueErrors of ``make``, which begin with the
-        name of a field, get the location of this value as a prefix."""
+        """Return the result of ``make``. A ValueError of ``make`` begins with the name
+        of a field; add the location of this value in front of it."""
         try:
             return make()
         except ValueError as error:
@@ -148,21 +147,24 @@ class Node:
     def items(
         self, expected: str = "an array", min_length: int = 0, max_length: float = math.inf
     ) -> Iterator[Node]:
-        """Return an iterator over the values of an array. A list of all nodes of a
-        large array would take far more memory than the file."""
+        """Return an iterator over the values of an array. For a large array, a list of
+        nodes would need far more memory than the file."""
         if not isinstance(self.value, list) or not min_length <= len(self.value) <= max_length:
             raise self.error(expected)
         return (Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value))
 
     def some_fields(self, required: tuple[str, ...]) -> dict[str, Node]:
-        """Return the fields of an object; the required fields must be present."""
+        """Return the fields of an object.
+
+        Raise an error if a required field is missing.
+        """
         if not isinstance(self.value, dict):
             raise self.error("an object")
         return {key: self.field(key) for key in dict.fromkeys((*required, *self.value))}
 
     def fields(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Node]:
-        """Return the fields of an object; the required fields must be present, and
-        unknown fields are an error."""
+        """Return the fields of an object. Raise an error if a required field is
+        missing, or if there is an unknown field."""
         fields = self.some_fields(required)
         for key, node in fields.items():
             if key not in required and key not in optional:
@@ -201,8 +203,8 @@ class Node:
         return self.number("radians between 0 and pi", 0, math.pi)
 
     def size(self) -> int:
-        """Return the side of a picture in px. Values such as 1920.0 are accepted,
-        because some programs write them."""
+        """Return the width or height of a picture in px. Values such as 1920.0 are
+        accepted, because some programs write them."""
         side = self.number()
         if side != int(side) or side <= 0:
             raise self.error("a positive whole number")

@@ -18,23 +18,23 @@ R = TypeVar("R")
 
 
 class _Judge(NamedTuple):
-    """A measuring process, and the end of its pipe in this process."""
+    """A measuring process, and this process's end of its pipe."""
 
     process: SpawnProcess
     pipe: Connection
 
 
 class Judges:
-    """Processes that measure items. Each process is started when it is first needed,
-    and ended by `close`."""
+    """Processes that measure items. A process is started when it is first needed, and
+    ended by `close`."""
 
     def __init__(self) -> None:
         self._cores = _system.num_processors()
         self._judges: list[_Judge] = []
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
-        """Yield each item with the result of ``measure`` for it, in order. Later items
-        are produced while earlier ones are measured.
+        """Yield each item with the result of ``measure`` for it, in order. While items
+        are measured, later ones are already produced.
 
         ``measure`` must be defined at the top level of a module, because other
         processes import it.
@@ -52,15 +52,16 @@ class Judges:
                 measured_item, pipe = waiting.popleft()
                 yield measured_item, cast(R, _answer(pipe))
         except BaseException:
-            # Results that are still pending would be taken for results of later items,
-            # so the processes are ended.
+            # End the processes, because results that are still pending would be
+            # mistaken for results of later items.
             self.close()
             raise
 
     def _pipe(self, number: int) -> Connection:
-        """Return the pipe to a process; start the process if it is not running yet."""
+        """Return the pipe to a process. If the process is not running yet, start it."""
         if number == len(self._judges):
-            resource_tracker.ensure_running()  # starting the tracker unblocks signals
+            # starting the tracker unblocks signals, so do it before blocking them
+            resource_tracker.ensure_running()
             # Only the parent process handles Ctrl-C. A new process must not be
             # interrupted before it can ignore the signal.
             previous_mask = _system.block_signals(_system.SIGNALS)
@@ -110,8 +111,8 @@ def _answer(pipe: Connection) -> object:
 
 
 def mean_of(rows: Sequence[Mapping[str, float | None]], *names: str) -> JsonObject:
-    """Return the mean of each column, rounded to six significant digits; None for a
-    column without values."""
+    """Return the mean of each column, rounded to six significant digits. It is None for
+    a column without values."""
     means: dict[str, float | None] = {}
     for name in names:
         values = [value for row in rows if (value := row.get(name)) is not None]

@@ -1,5 +1,5 @@
-"""Checks of numbers from users. Errors are one line that begins with the name of the
-argument."""
+"""Checks of numbers that users pass. An error text is one line that begins with the
+name of the argument."""
 
 import math
 import operator
@@ -28,8 +28,17 @@ class _Tensor(Protocol):
 
 
 def floats(values: object, name: str, expected: str = "numbers") -> Floats:
-    """Return numbers, an array or a torch tensor as a new array of doubles; raise
+    """Convert numbers, an array or a torch tensor to a new array of doubles. Raise
     ValueError unless all values are finite."""
+    array = doubles(values, name, expected)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
+    return array
+
+
+def doubles(values: object, name: str, expected: str = "numbers") -> Floats:
+    """Return numbers, an array or a torch tensor as a new array of doubles, which may
+    be infinite or NaN."""
     try:
         if hasattr(values, "detach"):
             array = np.asarray(cast(_Tensor, values).numpy(force=True))
@@ -41,7 +50,7 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
             array = np.array(array, dtype=np.float64, order="C")
     except OverflowError:
         raise ValueError(
-            f"{name}: expected {expected} that a double can hold, got a larger one"
+            f"{name}: expected {expected} below 1.8e308, the largest double, got a larger one"
         ) from None
     except (TypeError, ValueError, RuntimeError):
         kind = type(values).__name__
@@ -49,8 +58,6 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
         if dtype is not None:
             kind = f"{kind} of {dtype}"
         raise ValueError(f"{name}: expected {expected}, got {kind}") from None
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
     return array
 
 
@@ -89,8 +96,8 @@ def real(
     lower_bound: float = -math.inf,
     upper_bound: float = math.inf,
 ) -> float:
-    """Return one number from ``lower_bound`` to ``upper_bound``; raise ValueError
-    otherwise."""
+    """Return one number from ``lower_bound`` to ``upper_bound``. Raise ValueError for
+    other values."""
     number = math.nan
     try:
         if not getattr(value, "ndim", 0) and not isinstance(value, str):
@@ -107,15 +114,15 @@ def real(
 
 
 def positive(value: object, name: str) -> float:
-    """Return one positive finite number; raise ValueError otherwise."""
+    """Return one positive finite number. Raise ValueError for other values."""
     return real(value, name, "a positive number", 5e-324, MOST_DOUBLE)
 
 
 def whole(
     value: object, name: str, expected: str, lower_bound: int, upper_bound: int = MOST_INT
 ) -> int:
-    """Return one integer from ``lower_bound`` to ``upper_bound``; raise ValueError
-    otherwise."""
+    """Return one integer from ``lower_bound`` to ``upper_bound``. Raise ValueError for
+    other values."""
     try:
         number = operator.index(cast(SupportsIndex, value))
     except TypeError:
@@ -128,7 +135,7 @@ def whole(
 
 
 def whole_number(value: object, name: str) -> int:
-    """Return one integer of any size; raise TypeError for other values."""
+    """Return one integer of any size. Raise TypeError for other values."""
     try:
         return operator.index(cast(SupportsIndex, value))
     except TypeError:
@@ -142,13 +149,13 @@ def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
 
 
 def refuse(name: str | os.PathLike[str], expected: str) -> NoReturn:
-    """Raise the ValueError of `check`. Use this function where composing the message is
+    """Raise the ValueError of `check`. Use this function if composing the message is
     slow."""
     raise ValueError(f"{os.fspath(name)}: expected {expected}")
 
 
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
-    """Raise TypeError unless a value is an instance of ``kind``. Messages call that
+    """Raise TypeError unless a value is an instance of ``kind``. The message calls that
     type ``expected``."""
     if not isinstance(value, kind):
         advice = ""

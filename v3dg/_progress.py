@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Progress: TypeAlias = bool | Callable[[int, int, str], object]
-"""Whether to show progress; or a function that is called with the amount of finished
+"""Whether to show progress, or a function that is called with the amount of finished
 work, the total, and a text."""
 
 _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())
 _LINES = 4  # number of log lines for one piece of work
-_LEAST_SCALED = 10_000  # from this total on, a bar counts in thousands and millions
-_PATIENCE_SECONDS = 2.0  # Shorter work shows nothing.
+_LEAST_SCALED = 10_000  # a bar counts in thousands or millions from this total on
+_PATIENCE_SECONDS = 2.0  # Work that takes less time shows nothing.
 
 
 class Bar:
@@ -98,7 +98,7 @@ def counted(items: Iterable[T], total: int, name: str, progress: Progress) -> It
 @contextlib.contextmanager
 def waiting(text: str, *, show: bool) -> Iterator[None]:
     """Show that work of unknown duration is in progress, if it takes more than two
-    seconds. A terminal shows the elapsed seconds; a log gets one line."""
+    seconds. A terminal shows the elapsed seconds, and a log gets one line."""
     if not show:
         yield
         return
@@ -124,6 +124,6 @@ def _show_waiting(text: str, is_done: threading.Event) -> None:
         seconds = time.monotonic() - start
         print(f"\r{text} ... {seconds:.0f} s", end="", file=sys.stderr, flush=True)
         if is_done.wait(1.0):
-            # Erase the line.
+            # This sequence erases the line.
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
             return

@@ -1,15 +1,15 @@
 """Prepares a process that runs a command: reopens closed standard streams, and handles
 Ctrl-C.
 
-Ctrl-C, once or repeatedly, ends the process with one line. The package imports this
-module before modules that take long to import, so the module itself imports almost
-nothing. Until a command runs, nothing needs to be cleaned up, and Ctrl-C ends the
-process at once. While a command runs, Ctrl-C raises KeyboardInterrupt.
+Ctrl-C, once or repeatedly, ends the process with one line of text. The package imports
+this module before modules that take long to import, so this module itself imports
+almost nothing. Until a command runs, nothing needs to be cleaned up, so Ctrl-C ends the
+process immediately. While a command runs, Ctrl-C raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
 
-# The module `signal` without its enumerations, which take long to import.
+# This is the module `signal` without its enumerations, which take long to import.
 import _signal as signal  # type: ignore[import-not-found]
 import importlib
 import os
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 def refuse_sub_interpreter() -> None:
     """Raise ImportError in a sub-interpreter.
 
-    The compiled module and NumPy support only the main interpreter of a process.
+    The compiled module and NumPy only support the main interpreter of a process.
     Importing them in another one would wait forever.
     """
-    # The name of the module since Python 3.13, and its name before.
+    # The name of the module since Python 3.13, and its earlier name.
     for name in ("_interpreters", "_xxsubinterpreters"):
         try:
             interpreters = importlib.import_module(name)
@@ -51,7 +51,7 @@ def begin() -> None:
         signal.signal(signal.SIGINT, _end_at_once)
     _system.unblock_signals({signal.SIGINT})
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        # The null device takes the closed descriptors from 0 to 2. Otherwise a file
+        # Opening the null device fills the closed descriptors 0 to 2. Otherwise, a file
         # that is opened later could get one of them, and output would be written to
         # that file.
         pass
@@ -59,7 +59,7 @@ def begin() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        # Characters that the encoding lacks are printed as escapes.
+        # Characters that the encoding does not have are printed as escapes.
         getattr(sys, name).reconfigure(errors="backslashreplace")
 
 
@@ -73,8 +73,8 @@ def _end_at_once(number: int, frame: types.FrameType | None) -> None:
 
 
 def raise_interrupts() -> None:
-    """Make Ctrl-C raise KeyboardInterrupt from now on, if so far it ended the process
-    at once."""
+    """If Ctrl-C ends the process immediately so far, make it raise KeyboardInterrupt
+    from now on."""
     if signal.getsignal(signal.SIGINT) is _end_at_once:
         interrupts = _Interrupts()
         for number in reversed(_system.SIGNALS):
@@ -88,7 +88,7 @@ class _Interrupt(KeyboardInterrupt):
 
 class _Interrupts:
     """Raises at most one interrupt at a time, so that a second Ctrl-C does not
-    interrupt the cleaning up after the first one."""
+    interrupt the clean-up after the first one."""
 
     def __init__(self) -> None:
         import weakref
@@ -106,15 +106,14 @@ class _Interrupts:
             raise self._interrupt()
 
     def _interrupt(self) -> _Interrupt:
-        # The exception is created here and not in `handle`. Otherwise it and the frame
-        # of `handle` would refer to each other and stay alive.
+        # The exception is created here instead of in `handle`. Otherwise, it and the
+        # frame of `handle` would refer to each other and stay alive.
         interrupt = _Interrupt()
         self._raised = self._refer(interrupt)
         return interrupt
 
     def unraisable(self, arguments: sys.UnraisableHookArgs) -> None:
-        """Schedule an interrupt again that was swallowed by a destructor or a
-        callback."""
+        """Schedule an interrupt again if a destructor or a callback swallowed it."""
         if isinstance(arguments.exc_value, _Interrupt):
             self._raised = None
             _system.interrupt_soon()
@@ -131,7 +130,7 @@ def _is_importing(frame: types.FrameType | None) -> bool:
 
 
 refuse_sub_interpreter()
-# The name of the program is before the arguments; an interactive process has no such
+# The name of the program comes before the arguments. An interactive process has no such
 # name.
 if [os.path.basename(name) for name in sys.orig_argv[-len(sys.argv) :][:1]] in (
     ["v3dg"],

@@ -1,12 +1,12 @@
-"""What differs between operating systems: signals, fork(), processors and memory.
+"""Code that depends on the operating system: signals, fork(), processors and memory.
 
-Linux and macOS have all of POSIX that this package uses; Windows lacks the functions
+Linux and macOS have all of POSIX that this package uses. Windows lacks the functions
 that are looked up here. `_files` does the same for files.
 """
 
 from __future__ import annotations
 
-# The module `signal` without its enumerations, which take long to import.
+# This is the module `signal` without its enumerations, which take long to import.
 import _signal as signal  # type: ignore[import-not-found]
 import os
 import sys
@@ -30,8 +30,8 @@ _HAS_MASKS = hasattr(signal, "pthread_sigmask")
 
 
 def block_signals(numbers: Iterable[int]) -> set[int]:
-    """Block signals in this thread, and return those that were blocked before. Windows
-    blocks none."""
+    """Block signals in this thread, and return those that were blocked before. On
+    Windows, nothing is blocked."""
     if not _HAS_MASKS:
         return set()
     return set(signal.pthread_sigmask(signal.SIG_BLOCK, numbers))
@@ -43,7 +43,7 @@ def unblock_signals(numbers: Iterable[int]) -> None:
 
 
 def set_blocked_signals(numbers: Iterable[int]) -> None:
-    """Make these the blocked signals of this thread."""
+    """Make these signals the only blocked ones of this thread."""
     if _HAS_MASKS:
         signal.pthread_sigmask(signal.SIG_SETMASK, numbers)
 
@@ -70,8 +70,8 @@ def at_fork(
     in_parent: Callable[[], object] = _nothing,
     in_child: Callable[[], object] = _nothing,
 ) -> None:
-    """Call these functions before every fork(), and after it in both processes, on
-    systems that have it."""
+    """Call these functions before every fork(), and after it in both processes. Does
+    nothing on systems without fork()."""
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(before=prepare, after_in_parent=in_parent, after_in_child=in_child)
 
@@ -84,8 +84,8 @@ def num_processors() -> int:
 
 
 def available_memory() -> int:
-    """Return the memory of the system in bytes that is free or can be freed at once;
-    all memory of the system where the system does not report it."""
+    """Return the memory of the system, in bytes, that is free or can be freed
+    immediately. If the system does not report it, return all of its memory."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             for line in file:

@@ -1,4 +1,4 @@
-"""Calls of Windows for which Python has no functions."""
+"""Functions of Windows that Python does not provide."""
 
 import ctypes
 
@@ -46,7 +46,8 @@ def available_memory() -> int:
 
 
 def resident_memory() -> int:
-    """Return the memory of this process in bytes; 0 if Windows does not report it."""
+    """Return the memory of this process in bytes, or 0 if Windows does not report
+    it."""
     counters = _ProcessMemory()
     counters.length = ctypes.sizeof(counters)
     kernel = _kernel()

@@ -25,32 +25,33 @@ _WHOLE = ("torch.int32", "torch.int64")
 
 class CameraBatch:
     """B cameras of one size, in the convention of `Camera`: x right, y down, z forward.
-    They are pinholes, apart from those of `CameraBatch.of`.
+    They are pinhole cameras, unless `CameraBatch.of` made the batch.
 
-    Arrays on the host (NumPy, lists, torch tensors on the CPU) are copied, checked, and
-    read-only.
-    Torch tensors on a CUDA device are kept and read there each time that the batch is
-    drawn, so they may be changed in place between pictures; they are not checked,
-    because that would wait for the device. There a camera whose numbers are not those
-    of a camera (NaN, no rotation, a focal length that is not positive), or whose
-    environment the scene does not have, sees nothing: its picture is the background.
+    Arrays on the host (NumPy arrays, lists, torch tensors on the CPU) are copied,
+    checked, and read-only. Torch tensors on a CUDA device stay there. They are read
+    each time the batch is drawn, so they may be changed in place between pictures.
+    Their values are not checked, because that would wait for the device. A camera with
+    invalid values (NaN, a matrix that is not a rotation, a focal length that is not
+    positive), or with an environment that the scene does not have, sees only the
+    background.
 
     Attributes:
-        viewmats: (B, 4, 4) world to camera, rotations and translations.
-        K: (B, 3, 3) or (3, 3) for all: focal lengths and principal points in px,
-            without skew.
-        lenses: The cameras if some have lens distortion, which only the CPU draws;
-            otherwise None.
+        viewmats: (B, 4, 4) from world to camera, rotations and translations.
+        K: (B, 3, 3), or (3, 3) for all cameras: focal lengths and principal points in
+            px, without skew.
+        lenses: The cameras if some of them have lens distortion, which only the CPU can
+            draw; otherwise None.
         width, height: Size of each image in px.
-        near: Gaussians whose mean lies nearer than this depth are not drawn.
-        environments: (B,) the environment of each camera (see `Scene.environments`): it
-            sees the instances of that one and the shared ones, for -1 only the shared
-            ones. None: each camera sees all instances.
+        near: Gaussians whose mean is nearer than this depth are not drawn.
+        environments: (B,) the environment of each camera (see `Scene.environments`). A
+            camera sees the instances of its environment and the shared ones; with -1,
+            it sees only the shared ones. With None, each camera sees all instances.
 
     Raises:
         ValueError: A shape or a value is not as above; the message has the index of the
-            camera. On a CUDA device, arrays have other dtypes than float32 or float64,
-            and int32 or int64, or are not contiguous.
+            camera. On a CUDA device, the dtype of an array is not one of float32 and
+            float64 (or, for environments, int32 and int64), or an array is not
+            contiguous.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class CameraBatch:
         K: npt.ArrayLike,
         environments: npt.ArrayLike | None,
     ) -> None:
-        """Set copies of arrays on the host, after checks."""
+        """Copy arrays on the host, and check them."""
         self.viewmats = _reals(viewmats, "viewmats", (4, 4), is_one=False)
         self.K = _reals(K, "K", (3, 3), is_one=True)
         count = len(self.viewmats)
@@ -104,8 +105,8 @@ class CameraBatch:
     def _take_tensors(
         self, viewmats: Array, K: Array | npt.ArrayLike, environments: Array | npt.ArrayLike | None
     ) -> None:
-        """Set tensors on a CUDA device, unchanged; those on the host are copied to
-        it."""
+        """Use tensors on a CUDA device without copying them. Tensors on the host are
+        copied to the device."""
         import torch
 
         count = len(viewmats)
@@ -121,7 +122,7 @@ class CameraBatch:
             numbers = environment_numbers(environments, "environments", count)
             environments = torch.as_tensor(numbers, device=device)
         tensor = _tensor(environments, "environments", _WHOLE, [(count,)])
-        check("environments", tensor.device == device, f"a tensor on {device}")
+        check("environments", tensor.device == device, f"a tensor on {device}, got {tensor.device}")
         self.environments = tensor
 
     @classmethod
@@ -131,11 +132,11 @@ class CameraBatch:
         *,
         environments: Array | npt.ArrayLike | None = None,
     ) -> CameraBatch:
-        """Return cameras of one size and one near plane as a batch. Cameras with lens
-        distortion are drawn on the CPU only.
+        """Return a batch of cameras with the same size and the same near plane. Cameras
+        with lens distortion can only be drawn on the CPU.
 
         Raises:
-            ValueError: There is no camera, or a size or a near plane differs.
+            ValueError: There is no camera, or sizes or near planes differ.
         """
         check_type("cameras", cameras, Iterable, "a CameraBatch or a sequence of Cameras")
         cameras = list(cameras)
@@ -143,7 +144,8 @@ class CameraBatch:
         for number, camera in enumerate(cameras):
             check_type(f"cameras[{number}]", camera, Camera, "a Camera")
             is_alike = form_of(camera) == form_of(cameras[0])
-            check(f"cameras[{number}]", is_alike, "the size and the near plane of the first one")
+            expected = "the size and the near plane of cameras[0], got others; make two batches"
+            check(f"cameras[{number}]", is_alike, expected)
         first = cameras[0]
         batch = cls(
             np.stack([camera.viewmat for camera in cameras]),
@@ -172,9 +174,9 @@ class CameraBatch:
         """Return the cameras for the compiled operations of a device.
 
         Raises:
-            ValueError: The tensors are on another CUDA device, or the device is the
-                CPU and they are not; or the device is not the CPU, and cameras have
-                lens distortion.
+            ValueError: The tensors are on another CUDA device; or the device is the
+                CPU, and the tensors are not; or the device is not the CPU, and cameras
+                have lens distortion.
         """
         is_drawn = self.lenses is None or not device.is_cuda
         check("cameras", is_drawn, "pinholes on a CUDA device, got lenses; draw them one by one")
@@ -190,7 +192,7 @@ class CameraBatch:
                 return array
             import torch
 
-            # A copy, because torch warns of arrays that are read-only.
+            # This is a copy, because torch warns about read-only arrays.
             return torch.as_tensor(np.array(array), device=str(device))
 
         environments = None
@@ -211,7 +213,7 @@ class CameraBatch:
 
 
 def form_of(camera: Camera) -> tuple[int, int, float]:
-    """Return what the cameras of a batch have in common."""
+    """Return the properties that all cameras of a batch share."""
     return camera.width, camera.height, camera.near
 
 
@@ -222,7 +224,10 @@ def _is_on_device(array: object) -> bool:
 def _reals(
     values: npt.ArrayLike, name: str, shape: tuple[int, int], *, is_one: bool
 ) -> npt.NDArray[np.float64]:
-    """Return a copy as doubles (B, ...) or, if allowed, of one matrix for all."""
+    """Return a copy as doubles, (B, ...).
+
+    If allowed, the array may also be a single matrix for all cameras.
+    """
     try:
         array = floats(values, name)
     except ValueError:
@@ -236,8 +241,8 @@ def _reals(
 
 
 def _with_any_values(values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
-    """Return numbers that need not be finite, whose camera is named later; raise the
-    error of `floats` for anything else."""
+    """Return numbers that may be NaN or infinite; a later check names the camera. For
+    anything but numbers, raise the error of `floats`."""
     if hasattr(values, "detach"):
         values = cast("Array", values).numpy(force=True)
     array = np.array(values)
@@ -265,7 +270,7 @@ def environment_numbers(values: npt.ArrayLike, name: str, count: int) -> npt.NDA
 def _tensor(
     tensor: Array, name: str, dtypes: tuple[str, ...], shapes: list[tuple[int, ...]]
 ) -> Array:
-    """Return a tensor on a CUDA device without its gradient; raise ValueError for
+    """Return a tensor on a CUDA device without its gradient. Raise ValueError for
     another dtype, shape or layout."""
     shape = tuple(tensor.shape)
     expected = " or ".join(map(str, shapes))

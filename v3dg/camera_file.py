@@ -32,15 +32,15 @@ from v3dg.cameras import (
     viewmat_from_blender,
 )
 
-# COLMAP's names of cameras that OpenCV's models describe.
+# COLMAP's names of cameras that OpenCV's models can describe.
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-# The coefficients of a pinhole in a file of nerfstudio, unless it is a FULL_OPENCV. Its
-# k4 is not that of OpenCV, but the factor of r⁸.
+# The coefficients of a pinhole camera in a file of nerfstudio, unless it is a
+# FULL_OPENCV. In such a file, k4 is the factor of r⁸, which OpenCV does not have.
 _PINHOLE_TERMS = ("k1", "k2", "p1", "p2", "k3")
 _MOST_NAMED = 8  # number of images that a warning lists
 _RUN = "config.yml"  # a folder with this file is a run of nerfstudio
-# Transform from the data of a run to its training.
+# The file with the transform from the data of a run to its training.
 _TRAINING = "dataparser_transforms.json"
 _FRAMES = ("transforms.json", "transforms_train.json")
 _DATA = re.compile(
@@ -65,13 +65,13 @@ def read_cameras(
     """Read the cameras of a nerfstudio `transforms.json`, in file order
     (docs/scene.md).
 
-    ``path`` may also be
+    Instead of that file, ``path`` may be
 
     - the `cameras.json` that the code of the 3DGS paper writes;
     - a `camera_path.json` of nerfstudio's viewer, whose frames are named by their
       number unless they have a `file_path`;
-    - a folder with one of these files. If it contains `dataparser_transforms.json`
-      beside `transforms.json`, cameras are in the frame of that training;
+    - a folder with one of these files. If it has `dataparser_transforms.json` next to
+      `transforms.json`, cameras are in the frame of that training;
     - the folder or the `images` file of a COLMAP model, binary or text, whose cameras
       are named after their images;
     - the folder of a run of nerfstudio, or its `config.yml`, whose cameras are in the
@@ -93,8 +93,8 @@ def read_cameras(
             the original frame of the data.
 
     Raises:
-        ValueError: The content is invalid or has cameras of another model than those of
-            `Camera`; the message names the place in the file.
+        ValueError: The content is invalid, or it has cameras of a model that `Camera`
+            does not support; the message names the place in the file.
         OSError: The file cannot be read.
     """
     one_of(distortion, "distortion", ("draw", "ignore"))
@@ -126,7 +126,7 @@ def read_cameras(
 
 class _Place(NamedTuple):
     """The file with the cameras, and the file with the transform to the frame of a
-    training; None for the frame of the cameras' file."""
+    training. The latter is None if cameras stay in the frame of their file."""
 
     file: Path
     training: Path | None = None
@@ -151,8 +151,8 @@ def _place_of(path: Path) -> _Place:
 
 
 def _named(pairs: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
-    """Return cameras by name. If a name is empty or occurs twice, all are named by
-    their number, so that no camera replaces another."""
+    """Return cameras by name. If a name is empty or occurs twice, all cameras are named
+    by their number, so that no camera replaces another."""
     names = []
     cameras = []
     for name, camera in pairs:
@@ -179,7 +179,7 @@ def _file_in(folder: Path) -> Path:
 
 
 def _frames_at_top(document: Node) -> dict[str, Node]:
-    """Return the fields of a file with frames; raise a ValueError that describes any
+    """Return the fields of a file with frames. Raise a ValueError that describes any
     other file."""
     if document.has("keyframes") or document.has("camera_path"):
         advice = "save the path in nerfstudio's viewer, which then writes its frames, too"
@@ -259,8 +259,8 @@ def _read_frame(
     size: tuple[int, int] | None,
     distortion: str,
 ) -> Camera:
-    """Return the camera of a frame. Fields that the frame lacks are taken from the top
-    of the file."""
+    """Return the camera of a frame. If the frame lacks a field, it is taken from the
+    top of the file."""
     fields = {**top, **frame}
     lens_model, coefficients = _lens(fields, distortion)
     focal = top
@@ -271,12 +271,12 @@ def _read_frame(
     if "near" in fields:
         near = fields["near"].positive()
     viewmat = node.attempt(partial(viewmat_from_blender, _rows(fields["transform_matrix"])))
-    # The product with a transform gives the camera in the world before that transform.
+    # Multiplying by a transform gives the camera in the world before that transform.
     for transform, scale in transforms:
         # Camera rejects values that are not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             viewmat = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
-            viewmat[:3] /= scale  # the camera's rotation must have scale 1
+            viewmat[:3] /= scale  # the rotation of a camera must not include a scale
     return node.attempt(partial(Camera, viewmat, K, width, height, near, coefficients, lens_model))
 
 
@@ -304,8 +304,8 @@ def _data_of(run: Path) -> Path:
 
 
 def _trained(file: Path) -> tuple[Floats, float]:
-    """Return the transform from the frame of a run's training to that of its data, as
-    `_applied` returns it."""
+    """Return the transform from the frame of a run's training to the frame of its data,
+    in the form that `_applied` returns."""
     top = read_json(file).some_fields(("transform", "scale"))
     matrix = _rows(top["transform"])
     scale = top["scale"].positive()
@@ -359,7 +359,7 @@ def _camera_of(image: Image, place: str, distortion: str) -> Camera:
 
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:
-    """Write named cameras as a nerfstudio `transforms.json`, from which `read_cameras`
+    """Write named cameras as a nerfstudio `transforms.json`. `read_cameras` then
     returns the same cameras."""
     check_cameras(cameras)
     frames = []
@@ -440,8 +440,8 @@ def _term(fields: Mapping[str, Node], name: str) -> float:
 
 
 def _rows(node: Node) -> Floats:
-    """Return a (4, 4) matrix that the file stores as 3 or 4 rows. Like in other
-    readers, a fourth row is ignored."""
+    """Return a (4, 4) matrix that the file stores as 3 or 4 rows. As in other readers,
+    a fourth row is ignored."""
     num_rows = 4
     if isinstance(node.value, list) and len(node.value) == 3:
         num_rows = 3

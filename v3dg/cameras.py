@@ -1,5 +1,5 @@
-"""Cameras, pinholes or with lens distortion: made from matrices, from two points, or
-from Blender's convention, and series of cameras on a turntable."""
+"""Cameras without or with lens distortion. They are made from matrices, from two
+points, or from Blender's convention. Also makes series of cameras on a turntable."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,15 +19,15 @@ VectorLike: TypeAlias = Sequence[float] | npt.NDArray[np.generic]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[np.generic]
 Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = get_args(Axis)
-# Named as in COLMAP and nerfstudio.
+# The names are those of COLMAP and nerfstudio.
 LensModel: TypeAlias = Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE"]
 LENS_MODELS: tuple[LensModel, ...] = get_args(LensModel)
 # The coefficients of a distortion, in order.
 OPENCV_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
-# The order in which the core takes the coefficients of OPENCV.
+# The order of the coefficients of OPENCV in the core.
 _CORE_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-# Numbers of coefficients that each model may have.
+# How many coefficients each model may have.
 _NUM_COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
     "PINHOLE": (0,),
     "OPENCV": (4, 5, 8),
@@ -35,13 +35,14 @@ _NUM_COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
 }
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
-# The near plane as a fraction of the distance to the subject, and its bounds in world
-# units. Float32 can represent the inverse of the smaller bound.
+# The near plane as a fraction of the distance to the subject, and its limits in world
+# units. Float32 can represent the inverse of the smaller limit.
 _NEAR_SHARE = 0.01
 _MOST_NEAR = 0.01
 _LEAST_NEAR = 1e-30
-_MAX_TURNTABLE_CAMERAS = 1_000_000  # more would take minutes and is most likely a typo
-# Largest deviation of the rows of a rotation from orthonormal: matrices are often
+# more would take minutes, so a larger number is most likely a typo
+_MAX_TURNTABLE_CAMERAS = 1_000_000
+# How much the rows of a rotation may differ from orthonormal ones. Matrices are often
 # stored as float32 text.
 ROTATION_TOLERANCE = 1e-4
 
@@ -54,21 +55,22 @@ class Camera:
     double precision.
 
     The models are those of OpenCV's documentation of camera calibration. Points beyond
-    the first fold of a lens, where its image would turn back, are not drawn.
+    the first fold of a lens, where its image would fold back, are not drawn.
 
     Args:
-        viewmat: (4, 4) world to camera, a rotation and a translation.
+        viewmat: (4, 4) from world to camera, a rotation and a translation.
         K: (3, 3) focal lengths and principal point in px, without skew.
         width: Image width in px.
         height: Image height in px.
-        near: Gaussians whose mean has a smaller depth than this are not drawn; world
+        near: Gaussians whose mean has a smaller depth than this are not drawn. In world
             units, > 0.
-        distortion: Coefficients of the model in OpenCV's order: for "OPENCV" k1, k2,
-            p1, p2, or these and k3, or these and k3 to k6; for "OPENCV_FISHEYE" k1 to
-            k4; none for "PINHOLE".
+        distortion: Coefficients of the model in OpenCV's order. "OPENCV" has k1, k2,
+            p1, p2, optionally followed by k3, or by k3 to k6. "OPENCV_FISHEYE" has k1
+            to k4, and "PINHOLE" has none.
         model: "PINHOLE"; "OPENCV" with radial and tangential distortion; or
             "OPENCV_FISHEYE", whose field of view may exceed 180 degrees. The depth of a
-            fisheye is the distance from the eye, of others that along the axis.
+            point is its distance from the eye for a fisheye camera, and its distance
+            along the axis for the others.
 
     Raises:
         ValueError: A shape or a value is invalid.
@@ -93,8 +95,8 @@ class Camera:
         if viewmat[3].tolist() != [0, 0, 0, 1]:
             refuse("viewmat", f"the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
-        # `tolist` gives Python numbers. For so few values, NumPy is slower, and every
-        # frame may have a new camera.
+        # `tolist` returns Python numbers. For so few values, they are faster than
+        # NumPy, and every frame may have a new camera.
         (fx, skew, cx), (skew_y, fy, cy), last_row = K.tolist()
         if not (fx > 0 and fy > 0):
             refuse("K", f"positive focal lengths, got {fx:g} and {fy:g}")
@@ -130,15 +132,15 @@ class Camera:
         near: float | None = None,
     ) -> "Camera":
         """Make a camera at ``eye`` that has ``target`` at the image's centre and ``up``
-        upwards.
+        pointing upwards.
 
         Args:
             eye: (3,) position in the world.
             target: (3,) point in the world, not at the eye.
             up: (3,) direction in the world, not along the view.
-            fov_x: Horizontal field of view in radians; pixels are square.
+            fov_x: Horizontal field of view in radians. Pixels are square.
             near: See `Camera`. None means a hundredth of the distance to the target,
-                but at most 0.01, so that small subjects can be seen from near.
+                but at most 0.01, so that a camera can move close to a small subject.
 
         Raises:
             ValueError: The target is at the eye, or ``up`` lies along the view
@@ -156,7 +158,7 @@ class Camera:
             f"points whose distance a double can hold, got {_text(position)} and {_text(goal)}",
         )
         forward = (goal - position) / distance
-        # The scale of at most 1 prevents overflow and underflow of squares.
+        # Dividing by the largest component prevents overflow and underflow of squares.
         upwards = up_vector / (np.abs(up_vector).max() or 1.0)
         right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
@@ -187,10 +189,10 @@ class Camera:
         y up, z backward.
 
         Args:
-            transform_matrix: (4, 4) camera to world; its rotation is replaced by the
-                nearest exact rotation.
+            transform_matrix: (4, 4) from camera to world. Its rotation is replaced by
+                the nearest exact rotation.
             fov_x: Horizontal field of view in radians.
-            fov_y: Vertical field of view in radians; square pixels if None.
+            fov_y: Vertical field of view in radians. With None, pixels are square.
         """
         K = intrinsics(fov_x, fov_y, width, height)
         return cls(viewmat_from_blender(transform_matrix), K, width, height, near)
@@ -220,7 +222,8 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the camera is drawn as another model than a pinhole."""
+        """Whether the camera has lens distortion, so that it is not a pinhole
+        camera."""
         return self.model == "OPENCV_FISHEYE" or any(self.distortion)
 
     @property
@@ -235,7 +238,7 @@ class Camera:
             positions: (N, 2) u and v in px.
 
         Returns:
-            (N, 3) in camera coordinates. The multiple by a depth is the point at that
+            (N, 3) in camera coordinates. Multiply by a depth to get the point at that
             depth. NaN where the lens shows nothing.
 
         Raises:
@@ -271,7 +274,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class StereoCamera:
-    """Two cameras that look the same way, as the eyes in a headset do: they share one
+    """Two cameras that look the same way, like the eyes in a headset. They share one
     cut.
 
     Raises:
@@ -324,8 +327,8 @@ def for_each(
     camera: Camera | StereoCamera | Sequence[Camera],
     make: Callable[[Camera | StereoCamera], T],
 ) -> T | list[T]:
-    """Return the result of ``make`` for one camera, or a list of the results for
-    several cameras."""
+    """Return the result of ``make`` for one camera. For several cameras, return a list
+    of the results."""
     if hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0:
         return [make(view) for view in cast(Iterable[Camera], camera)]
     return make(cast(Camera, camera))
@@ -439,8 +442,8 @@ def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
 
 
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
-    """Convert a (4, 4) camera-to-world matrix in Blender's convention into a
-    world-to-camera matrix, whose rotation is the nearest exact rotation."""
+    """Convert a (4, 4) camera-to-world matrix in Blender's convention to a
+    world-to-camera matrix. Its rotation is replaced by the nearest exact rotation."""
     matrix = vector(transform_matrix, "transform_matrix", (4, 4))
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
     _check_rotation(axes, "transform_matrix")
@@ -449,8 +452,8 @@ def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
 
 
 def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
-    """Return (3, 3) K from fields of view in radians, with a central principal point;
-    if fov_y is None, pixels are square."""
+    """Return (3, 3) K for fields of view in radians, with a central principal point. If
+    fov_y is None, pixels are square."""
     width = _side(width, "width")
     height = _side(height, "height")
     fx = _focal(fov_x, "fov_x", width)
@@ -462,8 +465,8 @@ def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Fl
 
 def level_axes(camera: Camera, up: Floats) -> Floats:
     """Return the (3, 3) rotation from the world to a level frame, in which -y is up and
-    z is the horizontal direction of the camera; ValueError if it looks along
-    ``up``."""
+    z is the horizontal direction of the camera. Raise ValueError if the camera looks
+    along ``up``."""
     check("up", up.any(), "a direction other than zero, got (0, 0, 0)")
     axis = up / np.abs(up).max()  # prevents overflow and underflow of squares
     axis /= np.linalg.norm(axis)
@@ -479,8 +482,8 @@ def level_axes(camera: Camera, up: Floats) -> Floats:
 
 
 def _focal(fov: float, name: str, side: int) -> float:
-    """Return the focal length in px, from a field of view in radians and the px that it
-    spans."""
+    """Return the focal length in px, given a field of view in radians and the number of
+    px that it spans."""
     fov = real(fov, name, "radians between 0 and pi")
     focal = math.inf
     if 0 < fov < math.pi:
@@ -496,7 +499,7 @@ def _side(value: int, name: str) -> int:
 
 
 def _coefficients(distortion: Sequence[float], model: LensModel) -> tuple[float, ...]:
-    """Return the coefficients of a lens; ValueError for a wrong number of them."""
+    """Return the coefficients of a lens. Raise ValueError if their number is wrong."""
     one_of(model, "model", LENS_MODELS)
     expected = _NUM_COEFFICIENTS[model]
     values = tuple(real(value, "distortion") for value in distortion)
@@ -510,14 +513,14 @@ def _coefficients(distortion: Sequence[float], model: LensModel) -> tuple[float,
 
 
 def by_term(terms: Sequence[str], coefficients: Sequence[float]) -> dict[str, float]:
-    """Return the coefficients of a lens by their names; those that are left out are
+    """Return the coefficients of a lens by their names. Those that are left out are
     0."""
     return {**dict.fromkeys(terms, 0.0), **dict(zip(terms, coefficients, strict=False))}
 
 
 def _first_reaching(radius: Floats, end: float, function: Callable[[Floats], Floats]) -> Floats:
-    """Return where an increasing function has a value, by bisection from 0 to ``end``;
-    NaN where it is smaller everywhere."""
+    """Return where an increasing function reaches a value, by bisection from 0 to
+    ``end``. Return NaN if it stays smaller."""
     low = np.zeros_like(radius)
     high = np.full_like(radius, end)
     is_reached = function(high) >= radius
@@ -530,7 +533,7 @@ def _first_reaching(radius: Floats, end: float, function: Callable[[Floats], Flo
 
 
 def _fisheye_directions(image: Floats, coefficients: Sequence[float], end: float) -> Floats:
-    """Return unit vectors; ``image`` is in units of the focal lengths."""
+    """Return unit vectors. ``image`` is in units of the focal lengths."""
 
     def image_radius(angle: Floats) -> Floats:
         square = angle**2
@@ -543,7 +546,7 @@ def _fisheye_directions(image: Floats, coefficients: Sequence[float], end: float
 
 
 def _opencv_directions(image: Floats, coefficients: Sequence[float], end: float) -> Floats:
-    """Return (x / z, y / z, 1); ``image`` is in units of the focal lengths. The radial
+    """Return (x / z, y / z, 1). ``image`` is in units of the focal lengths. The radial
     distortion is inverted by bisection, and the tangential one by iteration."""
     terms = by_term(OPENCV_TERMS, coefficients)
     p1 = terms["p1"]

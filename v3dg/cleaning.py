@@ -11,22 +11,22 @@ from v3dg import _core
 from v3dg.gaussians import Gaussians
 
 LARGEST = _core.most_length
-"""Largest valid coordinate or scale, in world units: the square of a larger one could
+"""Largest valid coordinate or scale, in world units. The square of a larger one could
 overflow float32."""
 SMALLEST_OPACITY = float(np.float32(_core.min_alpha))
-"""Smallest opacity that can be visible: pixels skip contributions with a smaller
-alpha."""
+"""Smallest opacity that can be visible. Contributions with a smaller alpha are not
+blended."""
 OUTLIER_DISTANCE = 20.0
-"""Distance from the median position, as a multiple of the median distance, beyond which
-a gaussian counts as an outlier: sky, a floater or a mistake."""
+"""Gaussians farther than this from the median position, as a multiple of the median
+distance, count as outliers: sky, floaters or mistakes."""
 
-# Positions are coarse if float32 has steps above this share of the longest scale, for
-# at least this share of the gaussians.
+# Positions are coarse if the spacing of float32 exceeds this fraction of the longest
+# scale, for at least this fraction of the gaussians.
 _COARSE_STEP = 0.25
 _COARSE_SHARE = 0.5
 _MOST_SAMPLES = 100_000
 
-# Kinds of gaussians that cannot be drawn, in the order of the core's bits, with their
+# The reasons why gaussians cannot be drawn, in the order of the core's bits, with their
 # descriptions.
 _TEXT = {
     "means_not_finite": "with a position that is not finite",
@@ -40,7 +40,7 @@ _TEXT = {
     "transparent": "with an opacity below 1/255, which is invisible",
 }
 KINDS = tuple(_TEXT)
-# The bits of all kinds before "transparent".
+# The bits of all reasons before "transparent".
 _WRONG = (1 << KINDS.index("transparent")) - 1
 
 
@@ -56,8 +56,8 @@ class Findings:
 
     Attributes:
         drawable: (N,) bool, on the host.
-        counts: For each kind of fault, the number of gaussians that have it; kinds
-            without gaussians are missing. A gaussian can have several faults.
+        counts: The number of gaussians with each kind of fault. Kinds without gaussians
+            are missing. A gaussian can have several faults.
         wrong: (N,) bool, whether a gaussian has invalid values. Gaussians that are
             neither drawable nor wrong are valid but transparent.
     """
@@ -106,17 +106,17 @@ def examine(asset: Gaussians) -> Findings:
 
 
 def has_no_rotation(asset: Gaussians) -> npt.NDArray[np.bool_]:
-    """Return (N,) whether each quaternion is zero. A gaussian with a zero quaternion is
-    drawn without rotation, and quantised formats cannot store it."""
+    """Return (N,) whether each quaternion is zero. A gaussian with such a quaternion is
+    drawn without rotation. Quantised formats cannot store it."""
     return np.asarray(~asset.numpy().quats.any(axis=1))
 
 
 def outliers(
     means: npt.NDArray[np.float32], reference: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.bool_]:
-    """Return (N,) whether each finite position (N, 3) is an outlier: its distance from
-    the median of ``reference`` is more than 20 times the median distance. If
-    ``reference`` is None, it is the positions themselves."""
+    """Return (N,) whether each finite position (N, 3) is an outlier. An outlier is more
+    than 20 times the median distance away from the median of ``reference``. If
+    ``reference`` is None, the positions themselves are used."""
     if reference is None:
         reference = means
     if len(means) == 0 or len(reference) == 0:
@@ -129,21 +129,21 @@ def outliers(
 
 
 def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.floating], float]:
-    """Return the centre (3,) and the radius, which is positive, of a ball that contains
-    nearly all points (N, 3); N > 0.
+    """Return the centre (3,) and the positive radius of a ball that contains nearly all
+    points (N, 3). There must be at least one point.
 
-    A few gaussians of a trained asset are far away from all others and would make a
-    ball around all of them too large for a view.
+    Trained assets have a few gaussians far away from all others. A ball around all of
+    them would be too large for a view.
     """
     low, high = np.percentile(points, (1, 99), axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
 def coarse_note(gaussians: Gaussians) -> str | None:
-    """Return a sentence about gaussians on the host that lie so far from zero that
-    float32 rounds their positions visibly; None if they do not.
+    """If gaussians on the host are so far from the origin that float32 rounds their
+    positions visibly, return a sentence that says so. Otherwise return None.
 
-    Such numbers come from coordinates of the Earth and from placements far away.
+    Such coordinates come from geographic data, or from placing an asset far away.
     """
     stride = max(1, len(gaussians) // _MOST_SAMPLES)
     reach = np.abs(gaussians.means[::stride]).max(axis=1, initial=0.0)

@@ -2,8 +2,8 @@
 draws them at several distances.
 
 The result is one picture with a column for each distance. The upper row shows the full
-asset, the lower row the selected cut. Every panel states the number of gaussians, the
-time, and the error against the full asset at twice the resolution.
+asset, and the lower row the selected cut. Every panel shows the number of gaussians,
+the time, and the error compared with the full asset at twice the resolution.
 """
 
 import math
@@ -66,9 +66,8 @@ def run_demo(
         size: Width and height of one panel in px.
         views: Distance and elevation for each column, as in `VIEWS`.
         device: The device that builds and draws: "auto", "cpu" or "cuda".
-        keep: Folder in which the asset, its bundle and the scene with the cameras of
-            the columns are stored. It is created if needed. With None, they are not
-            stored.
+        keep: Folder for the asset, its bundle, and the scene with the cameras of the
+            columns. It is created if needed. With None, these files are not stored.
 
     Returns:
         Sizes, times and errors as a JSON object.
@@ -140,8 +139,8 @@ class _Files(NamedTuple):
 
     @classmethod
     def new(cls, keep: str | os.PathLike[str] | None) -> "_Files | None":
-        """Create a folder and return the paths of its files, which must not exist yet;
-        return None if `keep` is None."""
+        """Create a folder, and return the paths of its files. The files must not exist
+        yet. Return None if `keep` is None."""
         if keep is None:
             return None
         folder = Path(keep)
@@ -162,8 +161,8 @@ class _Files(NamedTuple):
         views: Sequence[tuple[float, float]],
         size: tuple[int, int],
     ) -> Scene:
-        """Write the asset, its bundle, and the scene with the cameras of the columns;
-        return the scene that the file describes."""
+        """Write the asset, its bundle, and the scene with the cameras of the columns.
+        Return the scene that is described by the file."""
         write_asset(self.asset, asset)
         scene.bundles[0].write(self.bundle)
         placed = Scene()
@@ -190,8 +189,8 @@ def _field(bundle: Bundle, count: int, seed: int) -> Scene:
 
 
 def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
-    """Return a camera that looks at the middle of the field: at one donut from a small
-    distance, at the whole hill from a large one."""
+    """Return a camera that looks at the middle of the field. From a small distance it
+    sees one donut, and from a large one the whole hill."""
     horizontal = distance * math.cos(elevation)
     target = 0.42 / (1 + (distance / 12) ** 2)
     x = math.sin(_AZIMUTH) * horizontal

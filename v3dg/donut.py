@@ -46,7 +46,8 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
     surface = _tube(on_tube, rng)
     if count:
         surface = surface.followed_by(_sprinkles(count, rng))
-    # In files of trained assets, the order is random, too.
+    # Shuffle the gaussians, because their order is random in files of trained assets,
+    # too.
     order = rng.permutation(num_gaussians)
     longest = 1.2 * surface.spacing * np.exp(rng.normal(scale=0.4, size=num_gaussians))
     middle = longest * np.exp(-rng.gamma(2, 0.25, num_gaussians))
@@ -82,7 +83,7 @@ class _Surface:
     gloss: Floats
 
     def followed_by(self, surface: "_Surface") -> "_Surface":
-        """Return a surface with the points of this one, followed by those of
+        """Return a surface with the points of this one, followed by the points of
         another."""
         pairs = zip(vars(self).values(), vars(surface).values(), strict=True)
         return _Surface(*(np.concatenate(arrays) for arrays in pairs))
@@ -93,7 +94,7 @@ def _tube(count: int, rng: np.random.Generator) -> _Surface:
     azimuth = rng.uniform(0, 2 * np.pi, count)
     angles = np.linspace(-np.pi, np.pi, 1000)
     # The angle in the cross-section of the tube is 0 at the outside and pi/2 at the
-    # top. Angles are chosen so that points are evenly distributed over the surface.
+    # top. Angles are chosen such that points are evenly distributed over the surface.
     share = (_RING * (angles + np.pi) + _TUBE * np.sin(angles)) / (2 * np.pi * _RING)
     section_angle = np.interp(rng.random(count), share, angles)
     phase = rng.uniform(0, 2 * np.pi, (2, 4, 1))
@@ -122,8 +123,8 @@ def _on_tube(azimuth: Floats, section_angle: Floats, radius: Floats) -> tuple[Fl
 
 
 def _sprinkles(count: int, rng: np.random.Generator) -> _Surface:
-    """Return sprinkles: rods of ``count`` points each, which lie on the icing in random
-    directions."""
+    """Return sprinkles. They are rods of ``count`` points each, which lie on the icing
+    in random directions."""
     azimuth = rng.uniform(0, 2 * np.pi, _SPRINKLES)
     section_angle = rng.uniform(0.2 * np.pi, 0.8 * np.pi, _SPRINKLES)
     seats, up = _on_tube(azimuth, section_angle, np.full(_SPRINKLES, _TUBE))
@@ -159,8 +160,8 @@ def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _lit(normals: Floats, albedo: Floats, gloss: Floats) -> Floats:
-    """Return SH coefficients (n, 4, 3) of colours lit by a sun and a sky. The linear
-    coefficients add highlights towards the reflection of the sun."""
+    """Return SH coefficients (n, 4, 3) of colours that are lit by a sun and a sky. The
+    linear coefficients add highlights in the direction of the sun's reflection."""
     facing = np.maximum(normals @ _TO_SUN, 0)[:, None]
     light = facing * np.array([1.5, 1.4, 1.2]) + (0.45 + 0.3 * normals[:, 2:]) * np.array(
         [0.5, 0.55, 0.62]

@@ -29,13 +29,13 @@ def crop_box(
 ) -> Gaussians:
     """Return the gaussians whose centres are in a box, or all others.
 
-    A centre on the surface counts as inside; a centre that is not finite counts as
+    A centre on the surface counts as inside. A centre that is not finite counts as
     outside.
 
     Args:
-        low: (3,) the corner with the smallest coordinates; -inf means no limit.
-        high: (3,) the opposite corner; inf means no limit.
-        keep: The part that is kept; "outside" removes the gaussians in the box.
+        low: (3,) the corner with the smallest coordinates. Use -inf for no limit.
+        high: (3,) the opposite corner. Use inf for no limit.
+        keep: The part that is kept. "outside" removes the gaussians in the box.
 
     Raises:
         ValueError: A corner is not three numbers, or a coordinate of ``high`` is less
@@ -64,13 +64,13 @@ def crop_sphere(
 ) -> Gaussians:
     """Return the gaussians whose centres are in a sphere, or all others.
 
-    A centre on the surface counts as inside; a centre that is not finite counts as
+    A centre on the surface counts as inside. A centre that is not finite counts as
     outside.
 
     Args:
         center: (3,) centre of the sphere.
         radius: Radius of the sphere, > 0.
-        keep: The part that is kept; "outside" removes the gaussians in the sphere.
+        keep: The part that is kept. "outside" removes the gaussians in the sphere.
 
     Raises:
         ValueError: An argument is invalid.
@@ -101,21 +101,22 @@ def drop_outliers(gaussians: Gaussians) -> Gaussians:
 
 
 def drop_transparent(gaussians: Gaussians, min_opacity: float) -> Gaussians:
-    """Return the gaussians whose opacity is at least a limit; NaN counts as less.
+    """Return the gaussians whose opacity is at least a limit. Gaussians with NaN are
+    removed.
 
     Raises:
         ValueError: The limit is not a number from 0 to 1.
     """
     limit = real(min_opacity, "min_opacity", "a number from 0 to 1", 0.0, 1.0)
     opacities = _check_gaussians(gaussians).numpy().opacities
-    # The limit is rounded to float32 like the opacities, so that an opacity of 0.1 is
-    # not below 0.1.
+    # The limit is rounded to float32, like the opacities, so that an opacity of 0.1 is
+    # not below a limit of 0.1.
     with np.errstate(invalid="ignore"):
         return gaussians.subset(opacities >= np.float32(limit))
 
 
 def to_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Return the gaussians with another SH degree, 0 to 3: coefficients of higher
+    """Return the gaussians with another SH degree, 0 to 3. Coefficients of higher
     degrees are removed, and missing ones are zero.
 
     Raises:
@@ -141,7 +142,7 @@ def to_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 
 
 def join(parts: Sequence[Gaussians]) -> Gaussians:
-    """Join assets into one, in order. The SH degree is the highest of all parts;
+    """Join assets into one, in order. The SH degree is the highest of all parts, and
     missing coefficients are zero.
 
     Use `Gaussians.transform` to place a part first.

@@ -1,11 +1,11 @@
-"""Chooses the first view of a subject: an object is seen from outside, a room from
+"""Chooses the first view of a subject. An object is seen from outside, and a room from
 inside.
 
-In a grid of voxels around most of the gaussians, the directions that are blocked from
-each place are counted (ambient occlusion). A subject counts as a room if much of its
-middle is empty, these empty places are blocked in nearly all directions, and there is
-content away from the outer walls. A solid object has no such empty places, and a hollow
-object has no content inside.
+A grid of voxels is laid over most of the gaussians, and the directions that are blocked
+from each place are counted (ambient occlusion). A subject counts as a room if much of
+its middle is empty, these empty places are blocked in nearly all directions, and there
+is content away from the outer walls. A solid object has no such empty places, and a
+hollow object has no content inside.
 """
 
 import itertools
@@ -28,43 +28,43 @@ from v3dg.upright import direction_of
 DEFAULT_ELEVATION = math.radians(20)
 """Elevation of the first camera above the horizon, in radians, for an object."""
 
-# Limits of the number of gaussians that are examined: enough for a good view, and quick
-# to read.
+# Minimum and maximum number of gaussians that are examined. They suffice for a good
+# view and can be read quickly.
 _MOST_GAUSSIANS = 60_000
 _MOST_INSTANCES = 15_000
-# Number of views that determine the distance of a turntable, from which each view shows
-# all of an object.
+# Number of views that determine the distance of a turntable. From that distance, each
+# view shows the whole object.
 _DISTANCE_VIEWS = 36
-# Margin on each side of the picture, as a share of its size.
+# Margin on each side of the picture, as a fraction of its size.
 _MARGIN = 0.04
 # Tangents of half the field of view, across the shorter side of the picture, and the
-# maximum across the longer side. Wider pictures would be distorted.
+# maximum across the longer side. A wider field of view would look distorted.
 _OUTSIDE_TANGENT = math.tan(math.radians(22.5))
 _OUTSIDE_MOST = 1.0
 _INSIDE_TANGENT = math.tan(math.radians(32.5))
 _INSIDE_MOST = 1.2
 _INSIDE_PITCH = math.radians(-8)
 
-# Length of a step by which a box grows, as a share of its side; the maximum number of
-# steps; and the minimum weight of the gaussians in a step, as a share of the total
-# weight.
+# A box grows in steps. These are the length of a step as a fraction of the box's side,
+# the maximum number of steps, and the minimum weight of the gaussians in a step as a
+# fraction of the total weight.
 _STEP = 0.06
 _MOST_STEPS = 100
 _LEAST_WEIGHT = 2e-4
 
 _VOXELS = 40  # number of voxels along each side of the grid
 _DIRECTIONS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
-# Limits that distinguish rooms from objects: the share of directions that must be
-# blocked from a place in a room, the clearance of such a place, and the share of the
+# Limits that distinguish rooms from objects: the fraction of directions that must be
+# blocked from a place in a room, the clearance of such a place, and the fraction of the
 # middle that such places fill. They were measured on captured and generated rooms,
 # towns, figures and rings.
 _CLOSED = 0.75
 _CLEARANCE = 0.1 * _VOXELS
 _LEAST_FREE = 0.1
-# Cosine of the angle to the zenith below which a direction counts if a place is open
-# above.
+# A place may be open above. Then only directions count whose angle to the zenith has a
+# smaller cosine than this.
 _SKYWARD = 0.5
-# Minimum share of the content that is away from the outer walls.
+# Minimum fraction of the content that is away from the outer walls.
 _LEAST_CONTENT = 0.02
 _WALL_VOXELS = 3
 
@@ -89,9 +89,11 @@ class Surroundings(NamedTuple):
     """The places inside a subject.
 
     Attributes:
-        places: (N, 3) free places that are closed on nearly all sides, but for the sky.
-        outer_share: The share of what is seen from outside that stands far from all
-            closed places, such as a roof and a garden; 1 if they are open above.
+        places: (N, 3) free places that are closed on nearly all sides, possibly except
+            above.
+        outer_share: The fraction of what is seen from outside that is far from all
+            closed places, such as a roof and a garden. It is 1 if the places are open
+            above.
     """
 
     places: Floats
@@ -128,11 +130,11 @@ class Framing:
         azimuth: float = 0.0,
     ) -> Camera:
         """Return the camera of the first view, for a picture of ``width`` x ``height``
-        px. All of an object is in the picture, whatever the aspect ratio is.
+        px. It shows the whole object, whatever the aspect ratio.
 
         Args:
             up: (3,) direction in the world.
-            elevation: Angle of the camera above the horizon in radians; used only for
+            elevation: Angle of the camera above the horizon, in radians. Only used for
                 an object.
             azimuth: Angle in radians by which the camera is moved around an object, or
                 rotated inside a room.
@@ -170,9 +172,10 @@ class Framing:
         *,
         elevation: float = DEFAULT_ELEVATION,
     ) -> list[Camera]:
-        """Return cameras that go around an object in a circle, each of which shows all
-        of it, or cameras that look around from inside a room. The distance does not
-        depend on ``count``, so the first view is the same for any number of views."""
+        """Return cameras that go around an object in a circle, each of which shows the
+        whole object, or cameras that look around from inside a room. The distance does
+        not depend on ``count``, so the first view is the same for any number of
+        views."""
         axis = _unit(up)
         if self._places is not None:
             size = (width, height)
@@ -250,9 +253,9 @@ def frame_subject(subject: Subject) -> Framing:
 
 
 def surroundings(subject: Subject, up: Axis) -> Surroundings | None:
-    """Return the places that a subject surrounds: those inside of a room, else those
-    with a ground, a free sky and walls around, as in a street or a yard; None if there
-    are none."""
+    """Return the places that a subject surrounds. In a room, they are the places
+    inside. Otherwise they are places with a ground, a free sky and walls around, as in
+    a street or a yard. Return None if there are none."""
     grid = _grid(_sample(subject))
     if grid is None:
         return None
@@ -291,7 +294,8 @@ def _empty_sample() -> _Sample:
 
 
 def _coarse_level(bundle: Bundle) -> Gaussians:
-    """Return the finest undamaged level that is quick to read, else the coarsest level.
+    """Return the finest undamaged level that can be read quickly. If there is none,
+    return the coarsest level.
 
     Damaged pages are not reported here, because drawing reports them.
     """
@@ -343,11 +347,12 @@ def _placed(local: _Sample, scene: Scene, instances: npt.NDArray[np.int64]) -> _
 
 
 def _box(means: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the minimum and the maximum corner of a box around the gaussians, without
-    those far away from the others.
+    """Return the minimum and the maximum corner of a box around the gaussians, except
+    for those far away from the others.
 
     The box begins as the middle 96 % along each axis. It grows in steps as long as the
-    next step contains gaussians, so that it includes thin tips but not a distant sky.
+    next step contains gaussians. Therefore it includes thin tips, but not a distant
+    sky.
     """
     low, high = np.percentile(means, (2, 98), axis=0)
     longest = float((high - low).max())
@@ -397,7 +402,7 @@ def _outwards(up: Floats, elevation: float, azimuth: float) -> Floats:
     """Return the (3,) unit vector from a subject to its camera.
 
     At azimuth 0, the camera is in front of the asset by the convention of viewers: on
-    the side of -y if z is the vertical axis, else on the side of +z.
+    the side of -y if z is the vertical axis, and otherwise on the side of +z.
     """
     front = np.array([0.0, 0.0, 1.0])
     if int(np.abs(up).argmax()) == 2:
@@ -429,8 +434,8 @@ def _across(forward: Floats, up: Floats) -> tuple[Floats, Floats]:
 def _eye_that_sees(
     points: Floats, forward: Floats, up: Floats, right_tangent: float, down_tangent: float
 ) -> Floats:
-    """Return the nearest eye (3,) whose frustum contains all points, with equal margins
-    on the left and the right, or above and below."""
+    """Return the nearest eye (3,) whose frustum contains all points. The margins on the
+    left and the right, or above and below, are equal."""
     right, down = _across(forward, up)
     depths = points @ forward
     place = np.zeros(3)
@@ -451,7 +456,7 @@ class _Grid(NamedTuple):
         origin, side: Minimum corner of the grid, and side of a voxel, in world units.
         density: (V, V, V) optical density across a voxel.
         distances: (26, V, V, V) distance in voxels from each voxel to the next solid
-            voxel in each direction; infinite without one.
+            voxel in each direction, or infinity if there is none.
     """
 
     origin: Floats
@@ -481,7 +486,7 @@ class _Places:
 
     def best(self, up: Floats) -> tuple[Floats, float]:
         """Return the place and the azimuth from which most is visible and nothing is
-        close. The result of the search is cached for each up vector."""
+        close. The result is cached for each up vector."""
         key = tuple(up.tolist())
         if key not in self._best:
             self._best[key] = self._search(up)
@@ -512,7 +517,7 @@ class _Places:
         in_height = np.abs(np.arcsin(np.clip(sines, -1, 1)) - _INSIDE_PITCH) < 0.6
         azimuths = np.arctan2(offsets @ aside, offsets @ front)
         numbers = np.round(azimuths / (2 * math.pi) * _AZIMUTHS).astype(np.int64) % _AZIMUTHS
-        # Near objects count negatively, because they hide the others.
+        # Near objects count negatively, because they hide others.
         weights = np.where(distances > 0.2 * self.size, 1.0, -4.0) * self.weights
         histogram = np.bincount(numbers[in_height], weights[in_height], _AZIMUTHS)
         reach = range(-_AZIMUTHS // 10, _AZIMUTHS // 10 + 1)
@@ -523,7 +528,7 @@ _AZIMUTHS = 36
 
 
 def _places(sample: _Sample) -> _Places | None:
-    """Return the places inside a subject if it is a room, otherwise None."""
+    """Return the places inside a subject if it is a room, and otherwise None."""
     grid = _grid(sample)
     if grid is None:
         return None
@@ -538,7 +543,7 @@ def _places(sample: _Sample) -> _Places | None:
 
 
 def _outer_share(grid: _Grid) -> float:
-    """Return the share of what is seen from outside that is farther than a wall from
+    """Return the fraction of what is seen from outside that is farther than a wall from
     all voxels that are closed on nearly all sides."""
     is_blocked = np.isfinite(grid.distances)
     is_closed = ~grid.is_solid & (is_blocked.mean(axis=0) > _CLOSED)
@@ -550,11 +555,11 @@ def _outer_share(grid: _Grid) -> float:
 def _free_places(
     grid: _Grid, distances: npt.NDArray[np.float32], is_possible: npt.NDArray[np.bool_]
 ) -> Floats:
-    """Return the (N, 3) free places that are closed on nearly all sides; none if they
-    have too small a share of the middle, or nothing stands among them.
+    """Return the (N, 3) free places that are closed on nearly all sides. Return none if
+    they fill too small a fraction of the middle, or if there is nothing between them.
 
     Args:
-        distances: (D, V, V, V) those of the grid in the directions that count.
+        distances: (D, V, V, V) the distances of the grid in the directions that count.
         is_possible: (V, V, V) whether a voxel may be such a place.
     """
     is_blocked = np.isfinite(distances)
@@ -577,7 +582,7 @@ def _free_places(
 
 
 def _grid(sample: _Sample) -> _Grid | None:
-    """Return a grid of voxels around most of a sample; None if there are too few
+    """Return a grid of voxels around most of a sample. Return None if there are too few
     gaussians to enclose a place."""
     means = sample.means
     if len(means) < 200:
@@ -627,7 +632,7 @@ def _shifted(step: int) -> slice:
 
 
 def _grown(mask: npt.NDArray[np.bool_], count: int, *, includes_rim: bool) -> npt.NDArray[np.bool_]:
-    """Return a mask that is dilated by `count` voxels; `includes_rim` says whether the
+    """Return a mask that is dilated by `count` voxels. `includes_rim` tells whether
     voxels outside the grid count as part of the mask."""
     grown = np.pad(mask, count, constant_values=includes_rim)
     for _ in range(count):

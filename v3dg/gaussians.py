@@ -18,12 +18,13 @@ if TYPE_CHECKING:
     import torch
 
 Array: TypeAlias = (
-    Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
+    # NumPy array or torch tensor; a union would make every use of a field a type error
+    Any
 )
 
 TRAINED_FILTER_PX2 = 0.3
-"""Variance of the screen-space filter that trainers draw with, px². It is the same in
-the code of 3DGS and in gsplat, with and without antialiasing."""
+"""Variance, px², of the screen-space filter in training. It is the same in the code of
+3DGS and in gsplat, with and without antialiasing."""
 
 _NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients per channel -> SH degree
 
@@ -43,8 +44,8 @@ def _kind(value: object) -> str:
 
 
 class _Trained:
-    """Whether gaussians were trained with antialiasing. The value is in a slot, so that
-    `vars` of gaussians contains only their arrays."""
+    """Whether gaussians were trained with antialiasing. The value is stored in a slot,
+    so that `vars` of gaussians only contains their arrays."""
 
     __slots__ = ("_antialiased",)
     _antialiased: bool | None
@@ -61,21 +62,21 @@ class Gaussians(_Trained):
     """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one
     kind on one device.
 
-    Torch tensors may all be float64 instead; `rasterize` then computes in float64,
-    other functions require float32.
+    Torch tensors may also all be float64. `rasterize` then computes in float64; other
+    functions require float32.
 
     Args:
         means: (N, 3) centres, in world units of the asset's own frame.
         quats: (N, 4) rotations as w, x, y, z; they need not be normalised.
-        scales: (N, 3) standard deviations along the rotated axes, in world units; not
-            logarithms.
-        opacities: (N,) in [0, 1]; not logits.
-        sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3; a
+        scales: (N, 3) standard deviations along the rotated axes, in world units (not
+            logarithms).
+        opacities: (N,) in [0, 1] (not logits).
+        sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3. A
             colour is ½ plus the value of the harmonics in the view direction.
 
-    Types, shapes, dtypes and memory layout are checked here, but not values. Nothing is
-    copied. `antialiased` is None at first; `trained` returns gaussians with another
-    value, which the results of all methods keep.
+    Types, shapes, dtypes and memory layout are checked here, but values are not.
+    Nothing is copied. `antialiased` is initially None. `trained` returns gaussians with
+    another value, which the results of all methods keep.
 
     Raises:
         TypeError: An argument is not an array, or NumPy and torch are mixed.
@@ -156,10 +157,10 @@ class Gaussians(_Trained):
         return marked
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
-        """Return the gaussians selected by a slice, an array of M indices (in their
-        order), or a mask of N booleans.
+        """Return the gaussians selected by a slice, by an array of M indices (in their
+        order), or by a mask of N booleans.
 
-        A slice with step 1 shares memory with this object; all other results are
+        A slice with step 1 shares memory with this object. All other results are
         copies.
 
         Raises:
@@ -179,7 +180,7 @@ class Gaussians(_Trained):
                 rows = rows.cpu().numpy()
             if isinstance(rows, slice) or rows.dtype == bool:
                 return self._map(lambda array: np.ascontiguousarray(array[rows]))
-            # take() releases the GIL, unlike [rows].
+            # take() releases the GIL, which indexing with [rows] does not.
             return self._map(lambda array: array.take(rows, axis=0))
         if not isinstance(index, slice):
             import torch
@@ -222,8 +223,8 @@ class Gaussians(_Trained):
 
     @staticmethod
     def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-        """Join gaussians of the same SH degree and array type, in order. `antialiased`
-        is kept if it is the same for all parts, else it is None.
+        """Join gaussians of the same SH degree and array type, in order. If
+        `antialiased` differs between the parts, it becomes None.
 
         Raises:
             ValueError: There are no parts, or they have different SH degrees.
@@ -300,14 +301,17 @@ def _restored(arrays: Sequence[Array], antialiased: bool | None) -> Gaussians:  
 
 
 def common(values: Sequence[bool | None]) -> bool | None:
-    """Return the value if all are equal; None if they differ or there are none."""
+    """Return the value if all are equal.
+
+    Return None if they differ or there are none.
+    """
     if len(set(values)) == 1:
         return values[0]
     return None
 
 
 def _aligned(tensor: Array) -> Array:
-    """Return a tensor, or a copy of it if its memory is not aligned to 16 bytes."""
+    """Return a tensor. If its memory is not aligned to 16 bytes, return a copy."""
     if tensor.data_ptr() % 16 == 0:
         return tensor
     return tensor.clone()
@@ -372,8 +376,8 @@ def _check_kind(name: str, array: Array, first: Array) -> None:
 
 
 def _checked_index(index: Array) -> Array:
-    """Return a mask or int64 indices, as a tensor if ``index`` is one, otherwise as a
-    NumPy array."""
+    """Return a mask or int64 indices. The result is a tensor if ``index`` is one, and
+    otherwise a NumPy array."""
     array: Array
     if _is_tensor(index):
         array = index.detach()

@@ -15,7 +15,10 @@ from v3dg.pictures import encode_png, write_picture
 
 @dataclass(frozen=True, eq=False)
 class ChannelPlanes:
-    """The channels of a picture beside colour; None unless requested."""
+    """The channels of a picture other than colour.
+
+    Each is None unless it was requested.
+    """
 
     median_depth: Array | None
     normal: Array | None
@@ -27,7 +30,7 @@ class ChannelPlanes:
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """The arrays of an `Image`; depth is None unless it was requested."""
+    """The arrays of an `Image`. The depth is None unless it was requested."""
 
     color: Array
     alpha: Array
@@ -42,13 +45,13 @@ class Sensed:
     AttributeError.
 
     Attributes:
-        median_depth: (...) depth of the first gaussian behind which at most half of the
-            light is left; 0 if more passes.
+        median_depth: (...) depth of the first gaussian at which the transmittance falls
+            to one half or less; 0 if there is none.
         normal: (..., 3) blended normal in the axes of the camera (x right, y down, z
             forward), of length 1, or 0 where nothing is drawn.
-        instance: (...) int32, the instance with the largest weight in the pixel; -1
-            where nothing is drawn, `v3dg.MESH` for a mesh without ids.
-        label: (...) int32, the label of that instance; -1 for none.
+        instance: (...) int32, the instance with the largest weight in the pixel. It is
+            -1 where nothing is drawn, and `v3dg.MESH` for a mesh without ids.
+        label: (...) int32, the label of that instance, or -1 if it has none.
         weight: (...) the largest weight, 0 to 1.
         clipped: (...) bool, whether a gaussian is missing because its centre is in
             front of the near plane, although its body extends beyond that plane.
@@ -97,10 +100,10 @@ class Image(Sensed):
     it.
 
     Attributes:
-        color: (H, W, 3) colour of the gaussians over the background; on black, this is
+        color: (H, W, 3) colour of the gaussians over the background. On black, this is
             premultiplied colour.
         alpha: (H, W) opacity of all gaussians together, without the background.
-        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn.
+        depth: (H, W) expected depth along the camera's axis, 0 where nothing is drawn.
             Raises AttributeError unless it was requested.
     """
 
@@ -158,18 +161,19 @@ class Stats(NamedTuple):
 
     Attributes:
         gaussians_selected: Number of gaussians in the selected clusters.
-        gaussians_in_frustum: Number of selected gaussians that are behind the near
+        gaussians_in_frustum: Number of selected gaussians that are beyond the near
             plane and whose extent intersects the image. Some of them may be culled
             later.
-        tolerance: Tolerance of the cut, px² per gaussian (see `v3dg.select`); with a
-            budget, the tolerance that meets it; 0 for an asset.
+        tolerance: Tolerance of the cut, px² per gaussian (see `v3dg.select`). With a
+            budget, it is the tolerance that meets the budget. For an asset, it is 0.
         select_ms: Time of the selection in ms.
         draw_ms: Time of drawing in ms.
-        levels: Number of selected gaussians of each level; empty on CUDA, for an asset,
-            and for a cut that the caller passed.
+        levels: Number of selected gaussians of each level. It is empty on CUDA, for an
+            asset, and for a cut that the caller passed.
         missing: Number of pages that the picture needs but that are not resident, so
-            that coarser ones are drawn instead; 0 if everything is resident, or after
-            `Renderer.settle`. `missing` and `failed` are counted when drawing begins.
+            that coarser ones are drawn instead. It is 0 if everything is resident, and
+            after `Renderer.settle`. `missing` and `failed` are counted when drawing
+            begins.
         failed: Number of pages that cannot be read.
         bytes_in: Number of bytes of the pages that became resident with this picture.
         memory: Size of the pool in bytes; None if everything is resident.
@@ -215,3 +219,19 @@ class RenderedImage(Image):
     @property
     def stats(self) -> Stats:
         return self._finish()
+
+
+class FinishedImage(RenderedImage):
+    """A picture that was drawn without the core."""
+
+    def __init__(self, planes: Planes, stats: Stats) -> None:
+        self._drawn = planes
+        self._finished_stats = stats
+
+    @property
+    def _planes(self) -> Planes | _core.Drawing | _core.Picture:
+        return self._drawn
+
+    @property
+    def stats(self) -> Stats:
+        return self._finished_stats

@@ -53,7 +53,8 @@ _READERS: dict[str, _Reader] = {
     "meta.json": sog.open_file,
     **dict.fromkeys((".ckpt", ".pt", ".pth"), checkpoint.open_file),
 }
-# Writers by the same; those of packed formats return the gaussians in the file's order.
+# Writers, by the end of the file's name. Writers of packed formats return the gaussians
+# in the order of the file.
 _WRITERS: dict[str, Callable[..., Gaussians | None]] = {
     ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
@@ -62,8 +63,8 @@ _WRITERS: dict[str, Callable[..., Gaussians | None]] = {
     **dict.fromkeys(usd.SUFFIXES, usd.write),
     ".sog": sog.write,
 }
-# For ends of file names of formats with axes, to which gaussians are converted: the
-# axis that points up in the file.
+# The axis that points up in a file, by the end of the file's name. Gaussians are
+# converted to the axes of these formats.
 _UP: dict[str, Axis] = dict.fromkeys((".spz", ".glb", *usd.SUFFIXES), "y")
 # Functions that list all files of an asset, by the end of the file's name.
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
@@ -73,14 +74,14 @@ _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "": lambda path: [path],
 }
 
-# For ends of file names of quantised formats: the ranges of values.
+# The ranges of values in quantised formats, by the end of the file's name.
 _PACKED: dict[str, Limits] = {
     ".compressed.ply": compressed_ply.LIMITS,
     ".spz": spz.LIMITS,
     ".sog": Limits(),
 }
 
-# Files of formats that consist of a folder; the first one describes the whole folder.
+# Files of formats that consist of a folder. The first one describes the whole folder.
 _FOLDER_INDICES = ("lod-meta.json", "meta.json")
 
 # Checkpoints of gsplat (one for each GPU) and of nerfstudio, and the files that the
@@ -100,7 +101,7 @@ WRITE_SUFFIXES = tuple(_WRITERS)
 
 def asset_file(path: AnyPath) -> AnyPath:
     """Return the file that describes the asset in a folder: its `lod-meta.json`, or
-    else its `meta.json`. A path of anything else is returned unchanged."""
+    else its `meta.json`. The path of anything but a folder is returned unchanged."""
     if is_url(path):
         return path
     for name in _FOLDER_INDICES:
@@ -111,17 +112,17 @@ def asset_file(path: AnyPath) -> AnyPath:
 
 
 def is_asset_by_content(path: AnyPath) -> bool:
-    """Return whether a local file's content shows an asset of a format that can be read
-    whatever the name of the file is."""
+    """Return whether a local file is an asset by its content. Only formats count that
+    can be read whatever the name of the file."""
     content = content_of(path)
-    # USD chooses the encoding by the suffix.
+    # USD does not count, because its library chooses the encoding by the suffix.
     return content is not None and content.suffix not in ("", *usd.SUFFIXES)
 
 
 def subject_name(path: AnyPath) -> str:
-    """Return the name of the subject in a file or at a URL: the file's name without its
-    suffix. For a file whose name is always the same, such as `lod-meta.json`, it is the
-    name of the folder."""
+    """Return the name of the subject in a file or at a URL. It is the name of the file
+    without its suffix. For a file whose name is always the same, such as
+    `lod-meta.json`, it is the name of the folder."""
     path = asset_file(path)
     file = beside(path)
     if file.name.lower() in _FOLDER_INDICES:
@@ -213,7 +214,7 @@ def open_asset(path: AnyPath) -> AssetFile:
 
 
 def _open_unnamed(path: AnyPath) -> AssetFile:
-    """Open a file whose name has no known end, with the reader for its content."""
+    """Open a file whose suffix is unknown. Its content selects the reader."""
     content = content_of(path)
     assert content is not None
     note = f"The end of its name is unknown; the file is {content.text} and was read as such."
@@ -222,8 +223,8 @@ def _open_unnamed(path: AnyPath) -> AssetFile:
 
 def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...]]:
     """Return the function that opens a file. If its content has another format than its
-    name, return the function for the content, and a note about this. If no reader
-    supports the content, raise ValueError."""
+    name, return the function for the content, and a note about this. Raise ValueError
+    if no reader supports the content."""
     content = content_of(path)
     if content is None or _READERS.get(content.suffix) is reader:
         return reader, ()
@@ -235,18 +236,18 @@ def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...
 
 
 def _noted(file: AssetFile, notes: tuple[str, ...]) -> AssetFile:
-    """Return the file with some notes in front of its own notes."""
+    """Return the file with some notes added in front of its own."""
     return replace(file, declared=replace(file.declared, notes=(*notes, *file.declared.notes)))
 
 
 def _open_fetched(at_url: FileAtUrl, reader: _Reader) -> AssetFile:
-    """Return an asset at a URL. The local copy exists as long as the result; errors
-    name the URL."""
+    """Return an asset at a URL. The local copy exists as long as the result. Error
+    texts name the URL."""
     with reading(at_url) as local:
         reader, notes = _by_content(local, reader)
         if reader is gltf.open_file:
-            # Files to which a document at a URL refers are read neither from the server
-            # nor from this machine.
+            # If a document at a URL refers to other files, they are read neither from
+            # the server nor from this machine.
             is_alone = len(gltf.files(pathlib.Path(local))) == 1
             expected = "the URL of an asset in one file, got one that refers to other files"
             check(shown(at_url), is_alone, f"{expected}; download its folder")
@@ -352,8 +353,8 @@ def write_measured(
     up: Axis = _axes.MEMORY_UP,
     version: Literal[2, 3, 4] | None = None,
 ) -> Losses | None:
-    """Write an asset as `write_asset` does, read it back, and return what the file
-    lacks of it; None for formats of float32 numbers, which lose nothing."""
+    """Write an asset as `write_asset` does, read it back, and return what the file has
+    lost. Return None for formats of float32 numbers, which lose nothing."""
     written = _write(path, gaussians, up, "binary_little_endian", version)
     limits = _of_name(path, _PACKED)
     if written is None or limits is None:
@@ -371,7 +372,10 @@ def _write(
     encoding: PlyEncoding,
     version: Literal[2, 3, 4] | None,
 ) -> Gaussians | None:
-    """Write an asset; returns the gaussians of a packed file in its order."""
+    """Write an asset.
+
+    For a packed format, return the gaussians in the order of the file.
+    """
     write = _by_name(path, _WRITERS)
     if version is not None:
         check(
@@ -396,14 +400,14 @@ def _write(
 
 
 def turned_up(path: AnyPath) -> Axis | None:
-    """Return the axis that points up in a file that `write_asset` writes, by the file's
-    name; None for formats without defined axes."""
+    """Return the axis that points up in a file that `write_asset` writes. It depends on
+    the end of the name. Return None for formats without defined axes."""
     return _of_name(path, _UP)
 
 
 def _of_name(path: AnyPath, formats: Mapping[str, Format]) -> Format | None:
-    """Return the value in a table for the end of a file's name, the first match; None
-    if no end matches."""
+    """Return the first value in a table whose key is the end of a file's name, or
+    None."""
     name = beside(path).name.lower()
     for ending, value in formats.items():
         if name.endswith(ending):

@@ -23,8 +23,8 @@ from v3dg.render import render
 from v3dg.scene import Subject
 
 FLIP_PIXELS_PER_DEGREE = 67.0
-"""Pixels per degree of a 0.7 m wide 4K display seen from a distance of 0.7 m, the
-viewing condition in the paper of FLIP."""
+"""Pixels per degree of a 0.7 m wide 4K display seen from a distance of 0.7 m. This is
+the viewing condition in the paper of FLIP."""
 
 MIN_TRANSMITTANCE = 1e-4
 """Transmittance at which pixels of reference pictures stop: a tenth of that of other
@@ -34,7 +34,7 @@ FLIP_MISSING = _extras.missing("flip_evaluator")
 
 
 def _pair(reference: Array, test: Array) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return both pictures as NumPy arrays; raise ValueError unless they have floats
+    """Return both pictures as NumPy arrays. Raise ValueError unless they have floats
     and the same size."""
     a = checked("reference", reference)
     b = checked("test", test)
@@ -66,8 +66,8 @@ def ssim(reference: Array, test: Array) -> float:
 
     The window is a Gaussian of 11×11 px with a standard deviation of 1.5 px. Variances
     are those of the population, borders are mirrored, and the result is the mean over
-    all pixels and channels. Values are not clipped. With other conventions the third
-    digit differs.
+    all pixels and channels. Values are not clipped. Other conventions change the third
+    digit.
 
     Raises:
         ValueError: A side is shorter than 6 px, which is less than half a window.
@@ -89,7 +89,7 @@ def has_flip() -> bool:
 
 def _flip(reference: Array, test: Array, *, magma: bool) -> NDArray[np.float32]:
     flip_evaluator = _extras.load("flip_evaluator")
-    # The arrays are new, because the evaluator may write into its arguments.
+    # The arrays are copied, because the evaluator may write into its arguments.
     a, b = (
         np.clip(picture, 0, 1).astype(np.float32, order="C") for picture in _pair(reference, test)
     )
@@ -99,8 +99,8 @@ def _flip(reference: Array, test: Array, *, magma: bool) -> NDArray[np.float32]:
 
 
 def flip_map(reference: Array, test: Array) -> NDArray[np.float32]:
-    """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), from 0, where no
-    difference is visible, to 1.
+    """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), from 0 (no visible
+    difference) to 1.
 
     Pictures are clipped to [0,1] first.
 
@@ -144,8 +144,8 @@ def box_downsample(image: Array, factor: int) -> Array:
 
 
 def errors_of(reference: Picture, test: Picture) -> dict[str, float | None]:
-    """Return the FLIP (None without the extra `flip`), the PSNR (None for equal
-    pictures) and the SSIM of two 8-bit pictures."""
+    """Return the FLIP, the PSNR and the SSIM of two 8-bit pictures. FLIP is None
+    without the extra `flip`, and PSNR is None for equal pictures."""
     a, b = (picture.astype(np.float32) / np.float32(255) for picture in (reference, test))
     errors: dict[str, float | None] = {"flip": None, "psnr": None, "ssim": ssim(a, b)}
     if has_flip():

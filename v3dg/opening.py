@@ -15,7 +15,7 @@ from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene, read_scene
 
 File: TypeAlias = str | os.PathLike[str]
-"""A path that functions accept in place of a subject; they open it with `open`."""
+"""A path that functions accept in place of a subject. They open it with `open`."""
 
 
 def open(path: str | os.PathLike[str]) -> Subject:
@@ -34,8 +34,7 @@ def open(path: str | os.PathLike[str]) -> Subject:
 
 
 def opened(subject: object) -> Any:
-    """Return the subject in a file; return anything other than a file name
-    unchanged."""
+    """Return the subject in a file. Anything but a file name is returned unchanged."""
     if isinstance(subject, str | os.PathLike):
         return open(subject)
     return subject
@@ -64,16 +63,16 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
 def read_usd_scene(
     path: str | os.PathLike[str], *, config: BuildConfig | None = None, device: str = "auto"
 ) -> Scene:
-    """Read an OpenUSD file as a scene: build a bundle from each asset in the file, and
-    place it at the poses of its instances.
+    """Read an OpenUSD file as a scene. A bundle is built from each asset in the file,
+    and placed at the poses of its instances.
 
     Instances are those of PointInstancers, which may be nested, and prims that refer to
     the same gaussians. Any other prim of gaussians is a single instance. Only the
     finest level of detail is read. Needs the extra `usd`.
 
     Args:
-        config: Settings of the builds; None builds levels without fitting them, which
-            takes seconds.
+        config: Settings of the builds. With None, levels are built without fitting
+            them, which takes seconds.
         device: The device that builds, see `build_bundle`.
 
     Raises:

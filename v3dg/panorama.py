@@ -18,8 +18,8 @@ from v3dg.cameras import Camera, VectorLike, level_axes, rigid
 from v3dg.image import Image
 from v3dg.pictures import MOST_SIDE
 
-# Tangents of 32 degrees, which is half the field of view of a side, and of 18 degrees
-# from its middle, beyond which it is blended with its neighbours.
+# Tangents of two angles from the middle of a side. The first, 32 degrees, is half of
+# its field of view. Beyond the second, 18 degrees, it is blended with its neighbours.
 _REACH = 0.625
 _UNBLENDED = 0.325
 # In the middle of a side, its pixels are smaller than those of the panorama by this
@@ -28,7 +28,7 @@ _DENSITY = 1.4
 _ROWS = 256  # number of rows that are resampled at once
 
 # Longitude and latitude, in degrees, of the middle of each side. The projection of a
-# gaussian is exact only in the middle of a side, so many narrow sides are far more
+# gaussian is only exact in the middle of a side, so many narrow sides are far more
 # precise than the six sides of a cube.
 _MIDDLES = [(0, 90), (0, -90), *itertools.product(range(0, 360, 45), (-45, 0, 45))]
 
@@ -49,12 +49,12 @@ def draw_panorama(
     The projection of a gaussian is exact in the middle of a pinhole picture and less
     exact towards its borders, above all for large gaussians close to the camera.
     Compared with pictures of 15 degrees, PSNR is 32 dB in a captured room and 34 dB in
-    a synthetic one; with the six sides of a cube it would be 22 and 30 dB.
+    a synthetic one. With the six sides of a cube, it would be 22 and 30 dB.
 
     Args:
         draw: Draws the picture of a pinhole camera, such as a `Renderer`'s `render`.
         camera: The camera whose position, azimuth and near plane are used.
-        up: (3,) direction in the world.
+        up: (3,) direction in the world that the first row shows.
         width: Width of the picture in px, even and at least 8. The height is half of
             it.
 
@@ -106,8 +106,8 @@ def _add(
     focal: float,
     place: tuple[int, int, int],
 ) -> None:
-    """Add the picture of a side to some rows of a panorama. `place` is the index of the
-    first row, and the panorama's height and width."""
+    """Add the picture of a side to some rows of a panorama. `place` has the index of
+    the first row, and the panorama's height and width."""
     first, height, width = place
     longitudes = ((np.arange(width) + 0.5) / width - 0.5) * 2 * math.pi
     rows = first + np.arange(len(planes))

@@ -53,8 +53,9 @@ def pick(
     renderer: Renderer | None = None,
 ) -> Pick | None:
     """Return the gaussian with the largest weight in pixel (x, y) of the picture that
-    `v3dg.render` draws; None if the pixel is empty. Its position is NaN where the lens
-    shows no direction, and a gaussian beside it reaches the pixel.
+    `v3dg.render` draws. Return None if the pixel is empty. The position of the gaussian
+    is NaN if the lens shows no direction at the pixel, but a gaussian next to it
+    reaches the pixel.
 
     Only this pixel is computed, on the CPU. The cut is the same on every device.
 
@@ -63,8 +64,8 @@ def pick(
         x: Column, from 0 at the left.
         y: Row, from 0 at the top.
         tolerance, budget, min_level: The same values as for the picture.
-        renderer: A renderer of the same scene with a pool on the CPU. Then only
-            gaussians in its pool are considered, and no pages are read.
+        renderer: A renderer of the same scene with a pool on the CPU. If it is given,
+            only gaussians in its pool are considered, and no pages are read.
 
     Raises:
         ValueError: The pixel is not in the image, or another argument is invalid for

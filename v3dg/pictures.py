@@ -21,11 +21,11 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 MOST_SIDE = 65_500
 """Largest side of a picture in px, which is JPEG's limit."""
 MOST_PIXELS_DRAWN = 1 << 27
-"""Maximum number of pixels of a picture that is drawn; each needs 20 bytes of
+"""Maximum number of pixels of a picture that is drawn. Each pixel needs 20 bytes of
 memory."""
 MOST_PIXELS_COMPARED = 1 << 25
-"""Maximum number of pixels of a picture that is compared: an 8K screen. Each needs 200
-bytes of memory."""
+"""Maximum number of pixels of a picture that is compared, which is that of an 8K
+screen. Each pixel needs 200 bytes of memory."""
 
 _GAP_PX = 6
 _TEXT_PX = 18
@@ -35,7 +35,7 @@ _INK = (238, 240, 243)
 
 def to_8bit(image: Array) -> Picture:
     """Convert display values from [0,1] to 0..255 with rounding, on the device of the
-    array. Other values are clipped."""
+    array. Values outside [0,1] are clipped."""
     if hasattr(image, "detach"):
         import torch
 
@@ -45,7 +45,7 @@ def to_8bit(image: Array) -> Picture:
 
 
 def checked(name: str, image: Array) -> NDArray[np.generic]:
-    """Return a picture (H,W,3) as a NumPy array on the host, without gradients; raise
+    """Return a picture (H,W,3) as a NumPy array on the host, without gradients. Raise
     TypeError or ValueError if it is not a picture."""
     if hasattr(image, "detach"):
         image = image.detach().cpu().numpy()
@@ -81,7 +81,7 @@ def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
-    """Check that the name of a picture has a known suffix; used before long work.
+    """Check before long work that the name of a picture has a known suffix.
 
     Raises:
         ValueError: The suffix is not one of ``SUFFIXES``.
@@ -123,7 +123,7 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
         # pictures.
         warnings.simplefilter("ignore")
         is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
-        check(name, is_known, "a PNG or a JPEG, got another file")
+        check(name, is_known, "a PNG or a JPEG, got another file; convert it first")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
             # Only these formats are allowed, because Pillow starts external programs
             # for some others.
@@ -155,12 +155,13 @@ def write_picture(
     Args:
         path: Path of the file. Its folder is created if needed.
         image: (H, W, 3) floats in [0, 1], or 8-bit values.
-        alpha: (H, W) coverage in [0, 1], for a transparent PNG; `image` is then the
-            premultiplied colours of a picture that was drawn on black, as floats. The
-            file has straight alpha: colours divided by alpha, as PNG demands.
+        alpha: (H, W) opacity in [0, 1], for a transparent PNG. `image` must then be
+            floats: the premultiplied colours of a picture that was drawn on black. The
+            file has straight alpha, which means colours divided by alpha, as PNG
+            requires.
 
     Raises:
-        TypeError, ValueError: A shape, a type or a value is invalid; or the suffix is
+        TypeError, ValueError: A shape, a type or a value is invalid, or the suffix is
             not that of a PNG or a JPEG (with `alpha`, only of a PNG).
         OSError: The file cannot be written.
     """

@@ -12,13 +12,14 @@ from v3dg.residency import ResidentScene, residency
 
 # Maximum amount of memory that stays free for frames, tables and other data.
 _RESERVE_BYTES = 1 << 30
-NUM_THREADS = 8  # threads that read pages; disks process several requests at once
+# number of threads that read pages; disks process several requests at once
+NUM_THREADS = 8
 _WAIT_SECONDS = 0.05  # maximum delay before Ctrl-C is handled
 
 
 def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
-    """Return the size in bytes for a pool on a device, half of its free memory; None if
-    all gaussians fit without a pool."""
+    """Return the size of a pool on a device in bytes, which is half of its free memory.
+    Return None if all gaussians fit without a pool."""
     for memory, num_bytes in residency.bytes_to_add(bundles, device).items():
         free = free_on(memory)
         if num_bytes > free - min(free // 4, _RESERVE_BYTES):
@@ -27,14 +28,14 @@ def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
 
 
 class Pool:
-    """Memory of a fixed size on one device, into which pages of bundles are loaded, and
-    from which they are evicted, as views need them.
+    """Memory of a fixed size on one device for pages of bundles. As views need them,
+    pages are loaded into it and evicted from it.
 
     Attributes:
         tables: The tables of the bundles.
         num_bytes: The size of the pool in bytes.
         lease: A lock that a thread holds from `settle` until its picture is drawn, so
-            that views of other threads do not evict the pages meanwhile.
+            that views of other threads do not evict the pages in between.
     """
 
     def __init__(
@@ -98,8 +99,8 @@ class Pool:
 
 
 class PoolSlot:
-    """The pool that single pictures of one subject share on one device. Only the pool
-    that was requested last is kept."""
+    """The pool that single pictures of one subject share on one device. Only the most
+    recently requested pool is kept."""
 
     def __init__(self) -> None:
         self._pool: Pool | None = None
@@ -118,10 +119,10 @@ class PoolSlot:
         device: Device,
         num_bytes: int,
     ) -> Pool:
-        """Return a pool of this size for these bundles. If the present pool is
-        different, it is freed first, because its memory may be needed.
+        """Return a pool of this size for these bundles. If the current pool does not
+        match, it is freed first, because its memory may be needed.
 
-        Requires the lock of `residency`.
+        The caller must hold the lock of `residency`.
         """
         pool = self._pool
         if pool is not None and pool.tables == tables and pool.num_bytes == num_bytes:

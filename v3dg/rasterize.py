@@ -1,5 +1,5 @@
-"""Draws gaussians without levels of detail: projects, bins and blends them.
-Differentiable for torch tensors."""
+"""Draws gaussians without levels of detail: projects, bins and blends them. Drawing is
+differentiable for torch tensors."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def rasterize(
     blended by ascending depth, and by index where depths are equal. A pixel stops
     before its transmittance would fall to 1e-4.
 
-    With torch tensors the picture is differentiable with respect to the gaussians'
-    means, quats, scales, opacities and sh, and to `background` if that is a tensor;
+    With torch tensors, the picture is differentiable with respect to the gaussians'
+    means, quats, scales, opacities and sh, and to `background` if that is a tensor.
     float64 tensors on the CPU are computed in float64. Tensors on a CUDA device are
     drawn there, on its current stream. Pictures and gradients are the same in every
     run.
@@ -107,7 +107,7 @@ def check_device(means: Array) -> None:
 
 
 def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return stacked tensors; a single tensor is not copied."""
+    """Return stacked tensors. A single tensor is not copied."""
     import torch
 
     if len(parts) == 1:
@@ -127,15 +127,16 @@ class DrawSettings:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The cameras of S sets of gaussians: C for each set, so that there are V = S * C
-    views.
+    """The cameras of S sets of gaussians. There are C cameras for each set, so V = S *
+    C views in total.
 
     Attributes:
-        cameras: The cameras of each set: one camera of any model, which is quicker than
-            a batch of one; or C pinholes whose arrays are on the CPU.
+        cameras: The cameras of each set: either one camera of any model, which is
+            faster than a batch of one, or C pinhole cameras whose arrays are on the
+            CPU.
         num_cameras: C.
-        viewmats: (V, 4, 4) tensor of the poses, if they have gradients. The cameras
-            must then be `_core.Cameras`.
+        viewmats: (V, 4, 4) tensor of the poses if they have gradients. The cameras must
+            then be `_core.Cameras`.
     """
 
     cameras: tuple[_core.Camera | _core.Cameras, ...]
@@ -147,8 +148,8 @@ class Views:
         return len(self.cameras) * self.num_cameras
 
     def inputs_of(self, group: Sequence[_T], number: int) -> Sequence[_T]:
-        """Return the values that a set uses, from one value for all views, one for each
-        set, or one for each view."""
+        """Return the values for a set. There may be one value for all views, one for
+        each set, or one for each view."""
         if len(group) == self.num_views > len(self.cameras):
             first = number * self.num_cameras
             return group[first : first + self.num_cameras]
@@ -159,8 +160,8 @@ class Views:
 
 @dataclass(eq=False)
 class CenterGradient:
-    """The gradient with respect to the centres on the images. The backward pass sets
-    it."""
+    """Holds the gradient with respect to the centres on the images. The backward pass
+    sets it."""
 
     value: torch.Tensor | None = None
 
@@ -172,14 +173,14 @@ class CenterProbe:
 
     Attributes:
         centers: Centres (V, N, 2)[pairs] for V views and N gaussians, in any shape.
-            Their values are not used; they exist so that autograd provides their
+            Their values are not used. They exist so that autograd requests their
             gradient.
         pairs: The index that selects the rows in `centers`.
         with_sizes: Whether `centers.absgrad` becomes the sum over pixels of absolute
             gradients.
         gradient: Receives the gradient with respect to `centers`. It is a separate
-            object, because the operation that made the centres keeps a reference to it;
-            a reference to the centres themselves would be a cycle.
+            object, because the operation that made the centres keeps a reference to it.
+            A reference to the centres themselves would be a cycle.
     """
 
     centers: torch.Tensor
@@ -194,12 +195,12 @@ def draw_views(
     inputs: Sequence[Sequence[torch.Tensor]],
     probe: CenterProbe | None = None,
 ) -> tuple[torch.Tensor, ...]:
-    """Draw tensors differentiably. Return colour, alpha and depth (or None) of the
-    first set, (C, H, W, ...), then those of the next set, and so on.
+    """Draw tensors differentiably. Return colour, alpha and depth (or None), (C, H, W,
+    ...), of the first set, then those of the next set, and so on.
 
     Args:
-        inputs: For each of means, quats, scales, opacities, sh and backgrounds: one
-            tensor, or one for each set; of the last three also one for each view.
+        inputs: For each of means, quats, scales, opacities, sh and backgrounds, one
+            tensor, or one for each set. The last three may also have one for each view.
         probe: Receives the gradient with respect to the centres on the images.
     """
     import torch
@@ -227,7 +228,7 @@ class _Call:
 
     views: Views
     settings: DrawSettings
-    counts: list[int]  # number of tensors of each kind of input
+    counts: list[int]  # number of tensors for each kind of input
     keep_tape: bool
     probe: CenterProbe | None
 
@@ -307,7 +308,8 @@ def _planes(drawn: _core.Rasterized | _core.RasterizedViews) -> list[torch.Tenso
         if plane is None:
             planes.append(None)
         elif isinstance(drawn, _core.Rasterized):
-            planes.append(torch.as_tensor(plane).unsqueeze(0))
+            # A view would forbid programs to change the picture in place.
+            planes.append(torch.as_tensor(plane).unsqueeze_(0))
         else:
             planes.append(torch.as_tensor(plane))
     return planes
@@ -322,8 +324,8 @@ def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) 
 
 
 def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch.Tensor:
-    """Store and return the gradient with respect to the centres, given that of each
-    set. Also store the sums of absolute gradients, if requested."""
+    """Store and return the gradient with respect to the centres, computed from that of
+    each set. If requested, also store the sums of absolute gradients."""
     import torch
 
     of_centers: list[torch.Tensor] = []
@@ -397,8 +399,8 @@ def _forward(ctx: _Context, inputs: Sequence[torch.Tensor]) -> tuple[torch.Tenso
 def _gradients_of_set(
     ctx: _Context, number: int, planes: Sequence[torch.Tensor | None], wants: Sequence[bool]
 ) -> _core.Gradients:
-    """Run the backward pass of a set. `wants` has three flags: whether gradients of the
-    centres, sums of their absolute values, and gradients of the poses are requested."""
+    """Run the backward pass of a set. `wants` has three flags, which request gradients
+    of the centres, sums of their absolute values, and gradients of the poses."""
     tape = ctx.tapes[number]
     d_color, d_alpha, d_depth = map(_to_core, planes)
     if isinstance(tape, _core.Tape):

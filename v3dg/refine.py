@@ -13,6 +13,7 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, check_pinhole
 from v3dg.levels.refined import DROP, RefineRequest
 from v3dg.levels.refined_units import refined_bundle
+from v3dg.levels.unfinished import discard_units, locked_units, units_folder
 from v3dg.levels.viewpoints import SeenFrom
 from v3dg.levels.whole import devices_for
 from v3dg.opening import File
@@ -37,13 +38,14 @@ def refine_bundle(
 ) -> Bundle:
     """Return a copy of a bundle whose levels look more like its asset.
 
-    A build fits every group alone, seen from all sides, at the size at which it is
-    selected. In pictures of whole cuts, gaussians of different groups hide each other.
-    With such pictures, this function drops the least visible gaussians of each level
-    above level 0 and optimises the others, until the pictures match those of the asset.
-    The number of gaussians in a cut is between that of the last level and 0.7 times
-    that of the asset. Pictures have 0.18 to 9.7 times the native size of the cut, which
-    is 2 px² per gaussian. docs/levels.md describes the gain.
+    A build fits every group alone, seen from all directions, at the size at which it is
+    selected. In pictures of whole cuts, however, gaussians of different groups hide
+    each other. This function compares pictures of cuts with pictures of the asset. It
+    drops the least visible gaussians of each level above level 0, and optimises the
+    others until the pictures match. The number of gaussians in a cut ranges from that
+    of the last level to 0.7 times that of the asset. The size of a picture ranges from
+    0.18 to 9.7 times the native size of its cut, which is 2 px² per gaussian.
+    docs/levels.md describes the gain.
 
     The same bundle, cameras, steps, share and seed give the same bits on the same kind
     of device.
@@ -54,36 +56,84 @@ def refine_bundle(
             than 4,194,304 gaussians, or 2,097,152 of SH degree 3, is refined in units
             of at most that size, and needs the memory of a unit; see `folder`.
         cameras: Cameras of the pictures, in a sequence or by name, such as those of the
-            asset's photographs. Views from other places may get worse.
-        seen_from: Where pictures are taken without cameras. "outside": from all around.
-            "inside": from up to 96 eyes in the free space that the asset surrounds.
-            "both": half of them each. "auto" finds out: inside if the asset surrounds a
-            free place with something in it, as a room does; both if that place is open
-            above, as a street is, or if more is seen from outside than its walls; else
-            outside. The config of the result says which.
+            asset's photographs. Views from other positions may get worse.
+        seen_from: Where pictures are taken from if there are no cameras. "outside"
+            means from all directions. "inside" means from up to 96 eyes in the free
+            space that the asset surrounds. "both" takes half of the pictures from each.
+            "auto" detects which of them applies. It is "inside" if the asset surrounds
+            a free place with something in it, as a room does. It is "both" if that
+            place is open above, as a street is, or if more than the walls is seen from
+            outside. In other cases, it is "outside". The config of the result records
+            the choice.
         steps: Number of pictures that are compared, for each unit. A GPU uses sixteen
             of them for each optimisation step, so the number is rounded up.
-        drop: Share of a level's visibility, 0 to 0.5, that may be lost by dropping its
-            least visible gaussians; 0 keeps all. Every further refinement of a bundle
-            drops gaussians again.
+        drop: Fraction of a level's visibility, 0 to 0.5, that may be lost by dropping
+            its least visible gaussians. 0 keeps all gaussians. Each further refinement
+            of a bundle drops gaussians again.
         seed: Seed of the pictures.
         device: The device that computes.
         progress: See `build_bundle`.
-        folder: Where the units of a large bundle are stored when they are finished. If
-            they are there already, from an interrupted call with the same arguments,
-            they are not refined again. The result reads its gaussians from there and
-            from the file of the bundle, which must be in a file. By default, units and
-            the result are in memory.
+        folder: Where finished units of a large bundle are stored. If the folder has
+            units of an interrupted call with the same arguments, they are not refined
+            again. The result reads its gaussians from the folder and from the file of
+            the bundle, so the bundle must be in a file. By default, units and the
+            result are in memory.
 
     Raises:
         TypeError: ``bundle`` is not a Bundle, or an element of ``cameras`` is not a
             Camera.
         ValueError: ``steps``, ``drop`` or ``seed`` is out of range, or ``seen_from`` is
-            inside or both and the asset surrounds no place.
-        RuntimeError: The device is "cuda" and cannot be used.
+            "inside" or "both" and the asset surrounds no place.
+        RuntimeError: The device is "cuda" and cannot be used, or another refinement is
+            using the folder.
         KeyboardInterrupt: Ctrl-C was pressed; threads have stopped, and finished units
             are in the folder.
     """
+    bundle, request = _checked(bundle, cameras, seen_from, steps, drop, seed)
+    devices = devices_for(device)
+    if folder is None:
+        return refined_bundle(bundle, request, devices, progress)
+    with locked_units(Path(folder)) as units:
+        return refined_bundle(bundle, request, devices, progress, units)
+
+
+def refine_file(
+    bundle: Bundle | File,
+    output: Path,
+    *,
+    cameras: Iterable[Camera] | Mapping[str, Camera] = (),
+    seen_from: SeenFrom = "auto",
+    steps: int = 30_000,
+    drop: float = DROP,
+    seed: int = 0,
+    device: str | Device = "auto",
+    progress: Progress = True,
+) -> Bundle:
+    """Write what `refine_bundle` returns to a file, and return it, opened from there.
+
+    Finished units of a large bundle are beside the file until it is written, so another
+    call with the same arguments continues after the last one.
+
+    Raises:
+        RuntimeError: Another refinement is writing this file, or the device is "cuda"
+            and cannot be used.
+        Exception: See `refine_bundle`.
+    """
+    bundle, request = _checked(bundle, cameras, seen_from, steps, drop, seed)
+    with locked_units(units_folder(output)) as units:
+        refined_bundle(bundle, request, devices_for(device), progress, units).write(output)
+        discard_units(output)
+    return Bundle.open(output)
+
+
+def _checked(
+    bundle: Bundle | File,
+    cameras: Iterable[Camera] | Mapping[str, Camera],
+    seen_from: SeenFrom,
+    steps: int,
+    drop: float,
+    seed: int,
+) -> tuple[Bundle, RefineRequest]:
     if isinstance(bundle, str | os.PathLike):
         bundle = Bundle.open(bundle)
     check_type("bundle", bundle, Bundle, "a Bundle")
@@ -99,8 +149,4 @@ def refine_bundle(
     steps = whole(steps, "steps", "at least 1 step", 1, 1_000_000)
     drop = real(drop, "drop", "a share from 0 to 0.5", 0, 0.5)
     seed = whole(seed, "seed", "a whole number from 0 to 2^58 - 1", 0, (1 << 58) - 1)
-    request = RefineRequest(steps, drop, seed, seen_from, tuple(cameras))
-    units_folder = None
-    if folder is not None:
-        units_folder = Path(folder)
-    return refined_bundle(bundle, request, devices_for(device), progress, units_folder)
+    return bundle, RefineRequest(steps, drop, seed, seen_from, tuple(cameras))

@@ -1,4 +1,4 @@
-"""Residency: the data of bundles and scenes on devices. It is the only cache of the
+"""Residency: the data of bundles and scenes on devices. This is the only cache of the
 package.
 
 Data is freed with its bundle or scene, or by `residency.clear()`. The buffers and pool
@@ -28,21 +28,21 @@ from v3dg.scene import Scene, Subject
 
 _T = TypeVar("_T")
 
-# Quantised bundles up to this size are decoded once on a GPU, rather than in each frame
-# and for each instance. The limit is about the size of the GPU's second-level cache.
-# For larger bundles, drawing the codes is as fast and needs a seventh of the memory.
+# Quantised bundles up to this size are decoded once on a GPU, instead of in each frame
+# for each instance. The limit is about the size of the GPU's second-level cache. For
+# larger bundles, drawing the codes is as fast and needs a seventh of the memory.
 MOST_DECODED_BYTES = 48 << 20
 # Bytes per gaussian that frames on a GPU need in addition to the gaussian's row.
 _PACKED_BYTES = 64
-# A size that exceeds any memory, so that pages are read only as pictures need them.
+# A size that exceeds any memory. With it, pages are only read when pictures need them.
 _TOO_MANY_BYTES = 1 << 62
 
-# Kinds of entries that a child after fork() must create again, because threads that
-# exist only in the parent may have been using them.
+# Kinds of entries that a child after fork() must create anew, because threads that only
+# exist in the parent may have been using them.
 _NOT_INHERITED = ("frame", "pool", "scene")
 
 _NO_VALUE = object()
-# Any number of threads may enter this context at once. The context is created only
+# Any number of threads may enter this context at the same time. It is created only
 # once, because every frame needs it.
 _NO_TURN = nullcontext()
 
@@ -61,8 +61,7 @@ class ResidentScene:
 
     Attributes:
         core: The corresponding object of the compiled module.
-        references: Weak references to the bundles. When bundles are added, this becomes
-            a new tuple.
+        references: Weak references to the bundles. Adding bundles replaces this tuple.
         revision: The revision of the scene that this data was made from.
     """
 
@@ -72,7 +71,7 @@ class ResidentScene:
         # The references are weak. Otherwise a bundle that is drawn without a scene
         # would keep itself alive.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
-        # Drawings that may be in progress.
+        # Drawings that may still be in progress.
         self._drawings: weakref.WeakSet[_core.Drawing | _core.Batch] = weakref.WeakSet()
         self._lock = threading.Lock()  # guards _drawings
         self.revision = (-1, -1, -1)
@@ -83,15 +82,15 @@ class ResidentScene:
         return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
     def is_of(self, subject: Subject) -> bool:
-        """Return whether this data is from the subject's current revision. A bundle
+        """Return whether this data belongs to the subject's current revision. A bundle
         never changes."""
         if isinstance(subject, Scene):
             return self.revision == subject.revision
         return self.revision[0] >= 0
 
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
-        """Update the data after a change of the scene: only the poses if nothing else
-        changed, otherwise all instances.
+        """Update the data after a change of the scene. If only the poses have changed,
+        only these are updated; otherwise, all instances are.
 
         Frames in progress are finished first, because a frame whose buffers were too
         small is drawn again from this data.
@@ -198,8 +197,8 @@ class Residency:
         """Return the data of a scene's current revision on a device. A bundle counts as
         a scene with one instance.
 
-        The result is often the same as in the last call. Passing that as ``last`` makes
-        the call faster.
+        The result is often the same as in the last call. Passing the last result as
+        ``last`` makes the call faster.
         """
         if last is not None and last.is_of(subject):
             return last
@@ -265,11 +264,11 @@ class Residency:
         return self.once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
 
     def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
-        """Return the number of bytes that are still needed on the device and on the
-        host to make all gaussians of these bundles resident on the device.
+        """Return how many more bytes are needed, on the device and on the host, to make
+        all gaussians of these bundles resident on the device.
 
-        A bundle at a URL counts as larger than any memory, so that its pages are
-        downloaded only as pictures need them.
+        A bundle at a URL counts as larger than any memory, so that its pages are only
+        downloaded when pictures need them.
         """
         add = {device: 0, CPU: 0}
         for bundle in bundles:
@@ -308,7 +307,7 @@ class Residency:
             self._entries.clear()
 
     def _draws_codes(self, bundle: Bundle, device: Device) -> bool:
-        """Return whether a device draws the codes of a bundle and not decoded
+        """Return whether a device draws the codes of a bundle instead of decoded
         gaussians."""
         if bundle.codes is None or not device.is_cuda:
             return bundle.codes is not None
@@ -325,8 +324,8 @@ class Residency:
         return self.once(bundle, ("decoded", device), decoded_bytes) == 0
 
     def once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _T]) -> _T:
-        """Return the entry of a bundle or scene with this key; create the entry first
-        if it does not exist."""
+        """Return the entry of a bundle or scene with this key. If it does not exist,
+        create it first."""
         with self.lock:
             if not isinstance(owner, Bundle):
                 owner = Scene.of(owner)  # raises an error for anything but a scene
@@ -338,8 +337,8 @@ class Residency:
     def last(
         self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _T]
     ) -> _T:
-        """Return the result of ``make`` for this value, from the cache if the last
-        value was the same. Otherwise the last result is freed first."""
+        """Return the result of ``make`` for this value. If the last value was the same,
+        the result comes from the cache. Otherwise, the last result is freed first."""
         with self.lock:
             last = self.once(owner, key, _LastResult)
             if last.value != value:
@@ -357,8 +356,8 @@ class Residency:
             for key in [
                 key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED
             ]:
-                # Entries of the parent are never destroyed, because destroying them
-                # would wait for threads that do not exist in the child.
+                # Entries of the parent are never destroyed in the child, because
+                # destroying them would wait for threads that do not exist there.
                 self._abandoned.append(entries.pop(key))
 
 

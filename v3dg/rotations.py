@@ -16,7 +16,7 @@ _LEAST = 1e-140
 _MOST = 1e140
 
 # Quaternions w x y z that rotate each axis to -y, which is the up direction of viewers
-# where y points down.
+# in which y points down.
 _HALF = math.sqrt(0.5)
 _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
     "x": (_HALF, 0.0, 0.0, -_HALF),
@@ -27,8 +27,8 @@ _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
     "-z": (_HALF, -_HALF, 0.0, 0.0),
 }
 
-# Largest relative deviation of a matrix from a similarity. It allows for numbers that
-# files round to a few digits.
+# Largest relative difference between a matrix and a similarity transform. It allows for
+# numbers that files round to a few digits.
 _SIMILAR = 1e-4
 
 
@@ -54,13 +54,14 @@ def turn_between(up: Axis, target: Axis) -> Floats:
 
 
 def product(first: Floats, second: Floats) -> Floats:
-    """Return quaternions (..., 4) w x y z that rotate by `second`, then by `first`."""
+    """Return quaternions (..., 4) w x y z that rotate by `second` first, and then by
+    `first`."""
     return np.asarray((first[..., None, :] @ product_matrix(second))[..., 0, :])
 
 
 def product_matrix(quaternions: Floats) -> Floats:
-    """Return the matrices M (..., 4, 4) of quaternions q for which p @ M, with row
-    vectors p (4,) of quaternions, is the quaternion product p q."""
+    """Return the matrices M (..., 4, 4) of quaternions q. With row vectors p (4,) of
+    quaternions, p @ M is the product p q."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     rows = [[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]
     return np.ascontiguousarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
@@ -87,8 +88,9 @@ def similarity_of(matrices: ArrayLike, name: str = "matrix") -> Similarity:
 
 
 def _check_similarities(matrices: Floats, largest: Floats, name: str) -> None:
-    """Raise a ValueError that describes why one of the matrices (I, 4, 4) is not a
-    similarity. ``largest`` contains the largest absolute value of each linear part."""
+    """Raise a ValueError that says why one of the matrices (I, 4, 4) is not a
+    similarity transform. ``largest`` has the largest absolute value of each linear
+    part."""
     is_affine = np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0.0) <= _SIMILAR
     _refuse_first(name, is_affine, lambda row: f"the last row {_text(matrices[row, 3])}")
     _refuse_first(name, largest > 0, lambda _: "a scale of 0")
@@ -177,8 +179,8 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
 def quaternions_from_rotations(rotations: Floats) -> Floats:
     """Return the unit quaternions (I, 4) w x y z, with w >= 0, of rotations (I, 3,
     3)."""
-    # Bar-Itzhack's method: the quaternion is an eigenvector of a symmetric matrix. It
-    # needs no case distinctions and is stable for any angle.
+    # This is Bar-Itzhack's method: the quaternion is an eigenvector of a symmetric
+    # matrix. It needs no case distinctions and is stable for any angle.
     trace = np.trace(rotations, axis1=1, axis2=2)
     symmetric = np.broadcast_to(trace[:, None, None], (len(rotations), 4, 4)).copy()
     skew = rotations - rotations.transpose(0, 2, 1)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from v3dg import _device
 from v3dg._device import CPU
-from v3dg._numbers import Floats, check, check_type, floats
+from v3dg._numbers import Floats, check, check_type, doubles
 from v3dg.camera_batch import environment_numbers
 from v3dg.opening import File, opened
 from v3dg.render.rays import cast_rays
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One turn of a LiDAR; `Lidar` defines its returns. Arrays are NumPy's, or torch
-    tensors on the CUDA device that made the scan.
+    """One turn of a LiDAR; `Lidar` defines its returns. The arrays are NumPy arrays, or
+    torch tensors on the CUDA device that made the scan.
 
     Attributes:
         lidar: The sensor.
-        pose: (4, 4) sensor to world.
+        pose: (4, 4) from sensor to world.
         range: (H, W) float32 distance of the first return along the ray, in world
             units; infinite where there is none.
         intensity: (H, W) float32 intensity of the first return; 0 where there is none.
-        second_range, second_intensity: The same for the second return.
-        alpha: (H, W) float32 share of the light that does not pass the scene.
+        second_range, second_intensity: Range and intensity of the second return.
+        alpha: (H, W) float32 fraction of the light that the scene stops.
         gaussians: Number of gaussians in the selected clusters.
     """
 
@@ -55,12 +55,13 @@ class Scan:
     gaussians: int
 
     def points(self) -> Array:
-        """Return (N, 3) the places of the first returns in the world, row by row: those
-        where the range is finite. They are in double precision, where the scan is."""
+        """Return the points of the first returns in the world, (N, 3), row by row. Rays
+        without a finite range are left out. The points are in double precision, on the
+        device of the scan."""
         return self._places(self.range)
 
     def second_points(self) -> Array:
-        """Return (M, 3) the places of the second returns in the world."""
+        """Return (M, 3) the points of the second returns in the world."""
         return self._places(self.second_range)
 
     def _places(self, ranges: Array) -> Array:
@@ -82,12 +83,12 @@ class Scan:
 
 
 class ScanBatch(Sequence[Scan]):
-    """Scans at B poses: a sequence of `Scan`, whose arrays are parts of those of the
-    batch.
+    """Scans at B poses. This is a sequence of `Scan`, whose arrays are views of the
+    arrays of the batch.
 
     Attributes:
         lidar: The sensor.
-        poses: (B, 4, 4) sensor to world.
+        poses: (B, 4, 4) from sensor to world.
         range, intensity, second_range, second_intensity, alpha: (B, H, W) as in `Scan`.
         gaussians: Number of gaussians in the selected clusters at each pose.
     """
@@ -162,28 +163,28 @@ def scan(
     min_level: int = 0,
     device: str | Device = "auto",
 ) -> Scan | ScanBatch:
-    """Scan a scene, a bundle or an asset with a LiDAR at a pose, or at each of several.
+    """Scan a scene, a bundle or an asset with a LiDAR, at one pose or at several.
 
-    All rays of a scan start at the same place at the same time. Gaussians are evaluated
-    on the rays and not projected.
+    All rays of a scan start at the same point at the same time. Gaussians are evaluated
+    on the rays; they are not projected.
 
-    On a CUDA device, all gaussians are resident, and buffers are kept with the scene or
-    the bundle and reused by its next scans. The call waits once for each group of poses
-    whose gaussians are cast together; the last of its work may be in progress on
-    torch's current stream when it returns.
+    On a CUDA device, all gaussians are resident. Buffers are stored with the scene or
+    the bundle, and reused by its next scans. The call waits once for each group of
+    poses whose gaussians are cast together. When it returns, the rest of its work may
+    be in progress on torch's current stream.
 
     Args:
-        subject: What to scan, in world space; or its file, which every call opens
-            again.
-        pose: (4, 4) sensor to world, a rotation and a translation; or (B, 4, 4). The
-            sensor has x forward (azimuth 0), y left and z up. Torch tensors of float32
-            or float64 on the CUDA device that scans stay there and are not checked: a
-            sensor whose pose is no rigid motion sees nothing.
+        subject: What to scan, in world space. If it is the path of a file, every call
+            opens the file again.
+        pose: (4, 4) or (B, 4, 4) from sensor to world, a rotation and a translation.
+            The sensor has x forward (azimuth 0), y left and z up. A float32 or float64
+            torch tensor on the CUDA device that scans stays there and is not checked.
+            If such a pose is not a rigid motion, its rays hit nothing.
         environment: The environment of the sensor (see `Scene.environments`), or (B,)
-            of the sensors: it sees the instances of that one and the shared ones, for
-            -1 only the shared ones. None: it sees all instances. Tensors of int32 or
-            int64 on the CUDA device stay there and are not checked: a sensor whose
-            environment the scene does not have sees nothing.
+            of the sensors. A sensor sees the instances of its environment and the
+            shared ones, for -1 only the shared ones. None: it sees all instances. An
+            int32 or int64 tensor on the CUDA device stays there and is not checked. If
+            the scene does not have such an environment, its rays hit nothing.
         tolerance, min_level: As in `v3dg.select`, with `Lidar.spacing` as the size of a
             pixel.
         device: As in `v3dg.render`.
@@ -241,9 +242,9 @@ def _cast_parts(
 
 
 def _poses_of(pose: _Poses, device: Device) -> tuple[Array, bool]:
-    """Return (B, 4, 4) poses, and whether there is only one that is no batch."""
+    """Return (B, 4, 4) poses, and whether a single pose was given."""
     if not getattr(pose, "is_cuda", False):
-        matrices = floats(pose, "pose")
+        matrices = doubles(pose, "pose")
         if matrices.ndim != 3:
             return checked_pose(matrices, "pose")[None], True
         for number, matrix in enumerate(matrices):

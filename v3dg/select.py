@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value", bound=np.generic)
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
-# The default tolerance: px² on screen for each gaussian of a coarser cluster.
-# docs/levels.md lists the errors.
+# The default tolerance: px² on screen per gaussian of a coarser cluster. docs/levels.md
+# lists the errors.
 DEFAULT_TOLERANCE = 3.0
 
 # The recommended fade for sequences of pictures. docs/fades.md describes its cost and
@@ -43,19 +43,19 @@ class Selection:
     """The clusters that one view needs, in ascending order of instance, then cluster.
 
     Attributes:
-        scene: The scene of the selection. Its instances may be moved, and instances may
-            be added. If instances are removed, the cut becomes invalid, and drawing it
-            raises ValueError.
+        scene: The scene of the selection. Instances may be moved and added afterwards.
+            If instances are removed, the cut becomes invalid, and drawing it raises
+            ValueError.
         instance_ids: (S,) int32 indices of instances, read-only.
         cluster_ids: (S,) int32 indices of clusters in the instance's bundle, read-only.
         num_gaussians: Number of gaussians in all selected clusters.
-        tolerance: The tolerance in px² per gaussian; with a budget, the tolerance that
-            meets it.
+        tolerance: The tolerance in px² per gaussian. With a budget, it is the tolerance
+            that meets the budget.
         seconds: Wall-clock time of the selection.
         revision: Revision of the scene at the time of the selection; None means the
             current revision.
-        given_weights: (S,) weights with which the clusters are drawn, read-only; None
-            without a fade, which means that all weights are 1.
+        given_weights: (S,) weights with which the clusters are drawn, read-only.
+            Without a fade, it is None, which means that all weights are 1.
     """
 
     scene: Scene
@@ -78,11 +78,8 @@ class Selection:
         weights = self.weights
         expected = f"{len(self)} numbers from 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
-        check(
-            "given_weights",
-            ((weights >= 0) & (weights <= 1)).all(),
-            f"{expected}, got other values",
-        )
+        is_wrong = ~((weights >= 0) & (weights <= 1))
+        check("given_weights", not is_wrong.any(), f"{expected}, got {weights[is_wrong][:1]}")
         for values in (self.instance_ids, self.cluster_ids, weights):
             values.flags.writeable = False
 
@@ -189,21 +186,21 @@ class Selection:
         return self._per_gaussian(antialiased, np.bool_)
 
     def _has_only_fade_filter(self, clusters: Clusters) -> npt.NDArray[np.bool_]:
-        """Return (C,) whether a cluster has no filter of its own but gets one from the
+        """Return (C,) whether a cluster has no filter of its own, but gets one from the
         fade."""
         fades = self.given_weights is not None
         return np.asarray((clusters.level == 0) & (clusters.filter_px2 == 0) & fades)
 
     def _first(self) -> npt.NDArray[np.int64]:
         """Return (S + 1,) the index of the first gaussian of each selected cluster,
-        followed by the total number of gaussians."""
+        then the total number of gaussians."""
         return np.concatenate(
             [[0], np.cumsum(self.per_pair(lambda clusters: np.diff(clusters.offset)))]
         )
 
     def per_pair(self, column: Callable[[Clusters], npt.NDArray[_Value]]) -> npt.NDArray[_Value]:
-        """Return (S,) the values of the selected clusters, given a function that
-        returns a column (C,) of the tables of a bundle."""
+        """Return (S,) the values of the selected clusters. The function returns a
+        column (C,) of the tables of a bundle."""
         scene = copy.copy(self.scene)
         self.check(scene.revision)
         columns = [column(bundle.clusters) for bundle in scene.bundles]
@@ -217,7 +214,7 @@ class Selection:
     def _per_gaussian(
         self, column: Callable[[Clusters], npt.NDArray[_Value]], dtype: type[_Value]
     ) -> npt.NDArray[_Value]:
-        # The dtype is explicit, because a scene without bundles has no column with a
+        # The dtype must be passed, because a scene without bundles has no column with a
         # dtype.
         return np.repeat(self.per_pair(column).astype(dtype), np.diff(self._first()))
 
@@ -268,27 +265,27 @@ def select(
         subject: A scene or a bundle; or the path of its file, which is opened in every
             call.
         camera: Camera of any model. For a stereo camera, the cut is detailed enough for
-            the nearer eye and includes everything that either eye may see. Stereo and
+            the nearer eye, and includes everything that either eye may see. Stereo and
             distorted cameras cannot be combined with the paper's footprint.
         tolerance: Largest screen area, in px² per gaussian, at which a coarser cluster
-            replaces finer ones. 0 chooses full detail wherever it covers any area;
+            replaces finer ones. 0 chooses full detail wherever it covers any area, and
             infinity chooses the coarsest clusters. None means `DEFAULT_TOLERANCE`, or 0
             with a budget.
         budget: Largest number of gaussians of one view. If the cut has more, the
             tolerance is raised, by the same factor for all instances, to the smallest
             value from which on no cut exceeds the budget. 2,048 values per octave are
             considered.
-        min_level: Clusters of finer levels than this are not chosen, except from
-            bundles with fewer levels.
+        min_level: Clusters of levels below this one are not chosen, except from bundles
+            with fewer levels.
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, which
             may choose several clusters on a path.
         cull: Whether to leave out clusters outside the frustum.
         fade: Clusters within this factor of the tolerance are drawn on two or more
-            levels, with weights that add up to exactly 1 on every path and depend only
+            levels, with weights that add up to exactly 1 on every path and only depend
             on the view. One level fades in while the other fades out, so that nothing
-            pops as the camera moves. A level 0 without its own filter is drawn with a
+            pops as the camera moves. If level 0 has no filter, it is drawn with a
             low-pass filter of 0.05 px², so that it does not flicker. `DEFAULT_FADE` is
-            meant for sequences of pictures; 1 and None choose one cluster on every
+            meant for sequences of pictures. 1 and None choose one cluster on every
             path. A fade cannot be combined with the paper's footprint.
         device: The device that selects: ``"cpu"``, ``"cuda"``, or ``"auto"``, which
             means CUDA if it can be used. All devices choose the same cut.
@@ -316,7 +313,7 @@ def select_by(
     steps: _core.BudgetSteps | None = None,
 ) -> Selection:
     """Select the cut of one view. `steps` is the state of a budget in a sequence of
-    views; None for a single view."""
+    views, or None for a single view."""
     check_camera(camera)
     start = time.perf_counter()
     with residency.turn(device):
@@ -350,7 +347,7 @@ def rule_of(
     cull: bool = True,
     fade: float | None = None,
 ) -> _core.Rule:
-    """Return the rule of a selection for the core; raise ValueError for a value that
+    """Return the rule of a selection for the core. Raise ValueError for a value that
     `select` does not accept."""
     if tolerance is None:
         tolerance = 0.0
@@ -383,7 +380,7 @@ def rule_of(
 
 
 def over_budget(budget: int, least: int) -> ValueError:
-    """Return the error for a budget that is smaller than the coarsest cut; ``least`` is
+    """Return the error for a budget that is smaller than the coarsest cut. ``least`` is
     the number of gaussians in that cut."""
     expected = f"at least {least}, the number of gaussians in the coarsest cut of this view"
     return ValueError(f"budget: expected {expected}, got {budget}")

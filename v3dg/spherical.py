@@ -1,4 +1,4 @@
-"""Sensors that look around themselves: equirectangular cameras and spinning LiDARs."""
+"""Sensors that see in all directions: equirectangular cameras and spinning LiDARs."""
 
 import math
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from v3dg._numbers import Floats, check, floats, positive, real, vector, whole
 from v3dg.cameras import Camera, MatrixLike, VectorLike, is_rotation, level_axes
 from v3dg.pictures import MOST_SIDE
 
-# The core's axes of a sensor (x forward, y left, z up) in those of a camera (x right,
-# y down, z forward).
+# The core's axes of a sensor (x forward, y left, z up) in the axes of a camera (x
+# right, y down, z forward).
 _SENSOR_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 _MOST_ANGLES = 1 << 20
-# Behind the gaussian that leaves less light than this, a ray ends.
+# A ray ends at the gaussian after which the transmittance is below this.
 MIN_TRANSMITTANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class RayTable:
-    """Rays in ascending order for the core, and their places in the picture.
+    """Rays in ascending order for the core, and their positions in the picture.
 
     Attributes:
         azimuth: (W,) radians in [0, 2π), ascending.
@@ -41,7 +41,8 @@ class RayTable:
     def of(cls, azimuth: Floats, elevation: Floats) -> "RayTable":
         """Return the table of angles in any order."""
         turned = np.mod(azimuth, 2 * math.pi)
-        turned[turned >= 2 * math.pi] = 0.0  # a tiny negative angle rounds up to a turn
+        # a tiny negative angle rounds up to a full turn
+        turned[turned >= 2 * math.pi] = 0.0
         column_order = np.argsort(turned, kind="stable")
         row_order = np.argsort(elevation, kind="stable")
         return cls(
@@ -69,20 +70,22 @@ class RayTable:
 class EquirectangularCamera:
     """Camera that sees all directions, in the equirectangular projection.
 
-    Columns are longitudes: the camera looks along z at the middle of the picture, and
-    its right border is half a turn to the right. Rows are latitudes, from -y (up) in
+    Columns are longitudes. The camera looks along z at the middle of the picture, and
+    the right border is half a turn to the right. Rows are latitudes, from -y (up) in
     the first to y in the last. Pixel (i, j) has its centre at (i + ½, j + ½).
 
-    Gaussians are not projected but evaluated on the ray of each pixel: a gaussian has
-    its largest value on the ray, and is blended in the order of the distances of those
-    places. So the picture has no seam, and its poles are as exact as its equator. The
-    tolerance of a cut, and a filter, are in pixels of the equator.
+    Gaussians are not projected, but evaluated on the ray of each pixel. A gaussian
+    contributes its largest value on the ray, and gaussians are blended in the order of
+    the distances of these values. Therefore the picture has no seam, and its poles are
+    as exact as its equator. The tolerance of a cut, and a filter, are in pixels of the
+    equator.
 
     Args:
-        viewmat: (4, 4) world to camera, a rotation and a translation; x right, y down,
-            z forward.
+        viewmat: (4, 4) from world to camera, a rotation and a translation; x right, y
+            down, z forward.
         width: Width in px, even and at least 8. The height is half of it.
-        near: Largest values nearer than this are not seen; world units, > 0.
+        near: A gaussian is not seen if its largest value on a ray is nearer than this.
+            In world units, > 0.
 
     Raises:
         ValueError: A shape or a value is invalid.
@@ -98,17 +101,17 @@ class EquirectangularCamera:
         width = whole(self.width, "width", expected, 8, MOST_SIDE)
         check("width", width % 2 == 0, f"{expected}, got {width}")
         near = positive(self.near, "near")
-        # The pinhole checks the pose.
+        # The pinhole camera checks the pose.
         pinhole = Camera(vector(self.viewmat, "viewmat", (4, 4)), np.eye(3), 1, 1, near)
         self.__dict__.update(viewmat=pinhole.viewmat, width=width, near=near, height=width // 2)
 
     @classmethod
     def level(cls, camera: Camera, up: VectorLike, width: int) -> "EquirectangularCamera":
-        """Return a camera at the position of another, which looks to the same side, but
-        horizontally.
+        """Return a camera at the position of another. It looks in the same direction,
+        but horizontally.
 
         Args:
-            up: (3,) direction in the world, which the first row shows.
+            up: (3,) direction in the world that the first row shows.
 
         Raises:
             ValueError: The camera looks along ``up``.
@@ -156,33 +159,34 @@ class EquirectangularCamera:
 
     @property
     def sensor_viewmat(self) -> Floats:
-        """(4, 4) world to the sensor of the core."""
+        """(4, 4) from the world to the sensor of the core."""
         return np.asarray(_SENSOR_FROM_CAMERA @ self.viewmat)
 
 
 @dataclass(frozen=True, eq=False)
 class Lidar:
-    """Spinning LiDAR: a ray for every elevation (row) and azimuth (column).
+    """Spinning LiDAR with one ray for every elevation (row) and azimuth (column).
 
-    A ray has up to two returns. The gaussians on it, in the order of the distances at
-    which they have their largest values, have blend weights, which are shares of the
-    light. A return is detected where the weights since the last return add up to
-    ``detection``. It consists of these gaussians and of all that follow within ``gap``
-    behind that place; its range is where half of its weight is reached, its intensity
+    A ray has up to two returns. The gaussians on a ray are ordered by the distances of
+    their largest values, and their blend weights are fractions of the light. A return
+    is detected as soon as the weights after the last return add up to ``detection``. It
+    consists of these gaussians, and of those that follow within the distance ``gap``.
+    Its range is the distance at which half of its weight is reached. Its intensity is
     the sum of its weights times the luma (BT.709) of their colours.
 
     Args:
         azimuth: (W,) radians from x towards y, in any order, such as
             ``np.linspace(0, 2 * np.pi, 2048, endpoint=False)``.
         elevation: (H,) radians above the xy plane, -π/2 to π/2, in any order.
-        near, far: Only places between these distances send light back; world units.
-        gap: Distance by which a second return is behind the place at which the first
-            was detected, in world units; > 0.
-        detection: Share of the light that a return has at least, above 0 and up to 1.
-        spacing: Angle in radians between rays for which the level of detail is chosen,
-            and the width of a pixel for filters. None means the root of the product of
-            the smallest steps of azimuth and of elevation, whose square is then one
-            over the largest density of rays at the horizon.
+        near, far: Only gaussians whose largest values are between these distances
+            return light. In world units.
+        gap: How far a second return must be behind the point at which the first one was
+            detected. In world units, > 0.
+        detection: Minimum fraction of the light in a return, above 0 and up to 1.
+        spacing: Angle in radians between rays. It determines the level of detail, and
+            is the size of a pixel for filters. None means the square root of the
+            smallest step of azimuth times the smallest step of elevation. Its square is
+            one over the largest density of rays at the horizon.
 
     Raises:
         ValueError: A shape or a value is invalid, or a single ray has no spacing.
@@ -240,8 +244,8 @@ class Lidar:
 
 
 def checked_pose(pose: object, name: str) -> Floats:
-    """Return a pose, sensor to world, (4, 4); ValueError unless it is a rotation and a
-    translation."""
+    """Return a pose (4, 4) from sensor to world. Raise ValueError unless it is a
+    rotation and a translation."""
     matrix = vector(pose, name, (4, 4))
     check(name, matrix[3].tolist() == [0, 0, 0, 1], f"the last row 0 0 0 1, got {matrix[3]}")
     expected = "a rotation in the upper left 3x3, got a matrix that scales, shears or mirrors"
@@ -260,8 +264,8 @@ def _angles(values: Sequence[float] | Floats, name: str, limit: float) -> Floats
 
 
 def _least_spacing(table: RayTable) -> float:
-    """Return the geometric mean of the smallest steps of azimuth and of elevation, or
-    the one of them that there is; ValueError for a single ray."""
+    """Return the geometric mean of the smallest steps of azimuth and of elevation. If
+    there is only one of them, return it. Raise ValueError for a single ray."""
     azimuth_steps = np.diff(table.azimuth, append=table.azimuth[0] + 2 * math.pi)
     least_steps = []
     for steps in (azimuth_steps[azimuth_steps < math.pi], np.diff(table.elevation)):

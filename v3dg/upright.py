@@ -1,5 +1,5 @@
-"""Determines the axis that points up: from a file, from cameras, from a ground plane,
-or by convention."""
+"""Determines the axis that points up. It comes from a file, from cameras, from a ground
+plane, or from a convention."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -22,18 +22,18 @@ _MIN_CAMERAS = 3
 # A direction counts as parallel to an axis if the cosine of the angle between them
 # exceeds this value (26 degrees).
 _NEAR_AN_AXIS = 0.9
-# Largest thickness of a ground plane relative to its smaller extent, both as standard
+# Maximum thickness of a ground plane relative to its smaller extent. Both are standard
 # deviations.
 _FLAT = 0.55
 
 
 class FoundUp(NamedTuple):
-    """The axis that is up in a subject.
+    """The axis that points up in a subject.
 
     Attributes:
         axis: The axis.
-        reason: Why, as a phrase.
-        is_guessed: Whether it is only what gaussians or cameras themselves show.
+        reason: The source of the axis, as a phrase.
+        is_guessed: Whether the axis was only derived from gaussians or cameras.
     """
 
     axis: Axis
@@ -67,8 +67,8 @@ def up_of(
 
     Args:
         cameras: Cameras that look at the subject, by name.
-        declared: What the file of an asset declares. None uses the declarations of the
-            file from which `read_asset` read the asset.
+        declared: The declarations of the asset's file. None uses those of the file from
+            which `read_asset` read the asset.
     """
     axis, reason, _ = found_up(subject, cameras, declared=declared)
     return axis, reason
@@ -80,7 +80,7 @@ def found_up(
     *,
     declared: Declared | None = None,
 ) -> FoundUp:
-    """Return what `up_of` does, and whether it is guessed."""
+    """Return the result of `up_of`, and whether it is guessed."""
     recorded: object = None
     if isinstance(subject, Scene):
         recorded = subject.up
@@ -108,8 +108,8 @@ def found_up(
 
 
 def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:
-    """Return gaussians rotated so that -y points up, given the axis `up` that points up
-    now. `write_asset`, and viewers of formats without axes, assume that -y is up.
+    """Return gaussians rotated so that -y points up. Currently, the axis `up` points
+    up. `write_asset`, and viewers of formats without axes, assume that -y is up.
     Colours are rotated, too.
 
     Raises:
@@ -119,8 +119,8 @@ def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:
 
 
 def _middles(subject: Bundle | Gaussians) -> Floats:
-    """Return the centres (N, 3) of gaussians of level 0; for a bundle, the centres of
-    its clusters, for which no page is read."""
+    """Return the centres (N, 3) of gaussians of level 0. For a bundle, return the
+    centres of its clusters, which requires no page."""
     if isinstance(subject, Gaussians):
         return np.asarray(subject.means[:: max(len(subject) // 100_000, 1)], np.float64)
     if not subject.num_levels:
@@ -130,7 +130,7 @@ def _middles(subject: Bundle | Gaussians) -> Floats:
 
 def _flat_axis(points: Floats) -> Axis | None:
     """Return the axis parallel to the normal of the plane in which the points lie,
-    ignoring outliers; None if they do not lie in a plane."""
+    ignoring outliers. Return None if they do not lie in a plane."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 16:
         return None

@@ -16,19 +16,19 @@ def write_video(
     when it is complete.
 
     Args:
-        pictures: (H, W, 3) floats in [0, 1], as NumPy arrays or torch tensors. All have
-            the same size; height and width are even.
+        pictures: (H, W, 3) floats in [0, 1], as NumPy arrays or torch tensors. All must
+            have the same size, with even height and width.
         fps: Pictures per second.
         quality: Constant rate factor, 0 to 51. Smaller values give better pictures and
-            larger files; at 18, no difference is visible.
+            larger files. At 18, no difference is visible.
 
     Returns:
         Number of pictures in the video.
 
     Raises:
         ImportError: The extra `video` is not installed.
-        ValueError: The suffix is not .mp4, there are no pictures, or the size of a
-            picture is odd or different from the first one.
+        ValueError: The suffix is not .mp4, there are no pictures, or a picture has an
+            odd size or another size than the first one.
     """
     av = _extras.load("av")
     check(path, os.fspath(path).endswith(".mp4"), "a file name ending in .mp4")

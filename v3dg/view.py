@@ -48,9 +48,8 @@ def view(
     """Show a scene, a bundle, an asset, or a file with one of them, in a web browser
     (docs/viewer.md).
 
-    The viewer's server runs on threads of this process. Its address is printed; it is
-    also the `url` of the returned site. The `close()` method of the site ends the
-    server.
+    The viewer's server runs on threads of this process. Its address is printed, and is
+    also the `url` of the returned site. Call `close()` of the site to end the server.
 
     Args:
         device: See `v3dg.render`.

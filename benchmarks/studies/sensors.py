@@ -2,9 +2,9 @@
 from the supersampled picture?
 
 `make` builds different assets into a folder. `measure` stands them on a floor and draws
-the same cameras at eye level with a batch of v3dg, with gsplat 1.5 and, if it can be
-imported, with the vectorized renderer for Isaac Sim. The others get all gaussians in
-world space. The study needs a GPU.
+the same cameras at eye level with a batch of v3dg, with gsplat 1.5 and, if they can be
+imported, with the vectorized renderer for Isaac Sim and the ray-traced sensor of
+Newton. The others get all gaussians in world space. The study needs a GPU.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ from v3dg import metrics
 from v3dg.pictures import Picture, to_8bit
 
 if TYPE_CHECKING:
+    import newton
     import torch
+    import warp
 
 Row: TypeAlias = dict[str, object]
 
@@ -41,6 +43,7 @@ _AISLE = 0.25  # half the width of the aisles between objects in units
 _SAMPLES = 8  # of a reference picture along each side of a pixel of the largest size
 _FEW = 4  # judged cameras that are drawn together
 _PEER_REPEATS = 3  # timed calls of other renderers
+_TRANSMITTANCES = (0.49, 0.01)  # of Newton: its default, and one for semitransparent pixels
 _SCENE_ID = 0  # the name of the only scene of the vectorized renderer
 
 
@@ -264,6 +267,91 @@ class Vectorized:
         return self._services[count, size]
 
 
+@dataclass
+class NewtonSensor:
+    """`newton.sensors.SensorCamera`, which traces a ray for each pixel.
+
+    A pixel that more light passes than `transmittance` is left empty, so small values
+    are needed for rays to gather what is semitransparent.
+    """
+
+    gaussians: v3dg.Gaussians
+    transmittance: float
+    device: str = "cuda"
+    _loaded: tuple[newton.Model, newton.sensors.SensorCamera] | None = None
+    _poses: dict[tuple[int, ...], warp.array] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return f"newton {self.transmittance:g}"
+
+    def draw(self, viewmats: torch.Tensor, K: torch.Tensor, size: int) -> torch.Tensor:
+        import newton
+        import torch
+        import warp
+
+        if self._loaded is None:
+            model = self._make_model()
+            self._loaded = (model, newton.sensors.SensorCamera(model))
+        model, sensor = self._loaded
+        count = len(viewmats)
+        focal_length = float(K[0, 1, 1])
+        rays = sensor.compute_camera_rays_pinhole(
+            size, size, camera_fov=2 * math.atan(size / (2 * focal_length)), device=self.device
+        )
+        picture = sensor.allocate_image_color(count, size, size)
+        sensor.update(
+            model.state(),
+            self._transforms(viewmats),
+            rays,
+            color_image=picture,
+            world_indices=warp.zeros(count, dtype=warp.int32, device=self.device),
+            render_config=sensor.RenderConfig(
+                gaussians_mode=sensor.GaussianRenderMode.QUALITY,
+                gaussians_min_transmittance=self.transmittance,
+            ),
+        )
+        packed = warp.to_torch(picture.view(warp.int32))
+        channels = [(packed >> shift) & 0xFF for shift in (0, 8, 16)]
+        return torch.stack(channels, dim=-1) / 255
+
+    def _make_model(self) -> newton.Model:
+        """Return a model with one world, in which all gaussians are one shape."""
+        import newton
+
+        g = self.gaussians
+        builder = newton.ModelBuilder()
+        builder.begin_world()
+        builder.add_shape_gaussian(
+            -1,
+            gaussian=newton.Gaussian(
+                to_numpy(g.means),
+                np.roll(to_numpy(g.quats), -1, axis=1),
+                to_numpy(g.scales),
+                to_numpy(g.opacities),
+                to_numpy(g.sh)[:, 0],
+            ),
+        )
+        builder.end_world()
+        return builder.finalize(device=self.device)
+
+    def _transforms(self, viewmats: torch.Tensor) -> warp.array:
+        """Return poses from camera to world, whose cameras look along -z. They are
+        computed once, because the time of a draw does not include them."""
+        import warp
+
+        key = (viewmats.data_ptr(), *viewmats.shape)
+        if key not in self._poses:
+            to_world = np.linalg.inv(to_numpy(viewmats).astype(np.float64))
+            to_world[:, :, 1:3] *= -1
+            poses = []
+            for matrix in to_world:
+                turn = warp.quat_from_matrix(warp.mat33(*matrix[:3, :3].ravel()))
+                poses.append([*matrix[:3, 3], *turn])
+            self._poses[key] = warp.array(poses, dtype=warp.transformf, device=self.device)
+        return self._poses[key]
+
+
 class Comparison:
     """A scene's reference pictures, and the measurements of each renderer."""
 
@@ -334,6 +422,8 @@ class Comparison:
             peers.append([filtered])
         if importlib.util.find_spec("isaacsim_gaussian_renderer") is not None:
             peers.append([Vectorized(self.world)])
+        if importlib.util.find_spec("newton") is not None:
+            peers.append([NewtonSensor(self.world, bound) for bound in _TRANSMITTANCES])
         return peers
 
     def _cameras_of(self, size: int) -> list[v3dg.Camera]:

@@ -16,8 +16,8 @@
 namespace v3dg {
 
 // Computes items 0 to count - 1, which are used in this order. Thread i % num_threads
-// computes item i, without further threads for parallel loops. Item i occupies slot
-// i % num_places until it has been used.
+// computes item i, without starting threads for parallel loops. Item i occupies slot i
+// % num_places until it has been used.
 class Ahead {
   public:
     Ahead(uint64_t count, unsigned num_threads, unsigned num_places,
@@ -38,8 +38,8 @@ class Ahead {
     Ahead(const Ahead&) = delete;
     Ahead& operator=(const Ahead&) = delete;
 
-    // Waits for the next item, and returns its slot. Rethrows the exception of the
-    // computation, if any.
+    // Waits for the next item, and returns its slot. If computing it threw an
+    // exception, rethrows it.
     size_t wait_for_next() {
         const MutexLock lock(busy_);
         while (!is_made_[used_ % num_places_] && !error_) changed_.wait(busy_);
@@ -76,8 +76,8 @@ class Ahead {
         while (item >= used_ + num_places_ && !is_over_) changed_.wait(busy_);
         return !is_over_;
     }
-    // The lock is not in the catch block, because Clang's thread-safety analysis skips
-    // catch blocks.
+    // The mutex is not locked in the catch block, because Clang's thread-safety
+    // analysis skips catch blocks.
     void fail(const std::exception_ptr& error) noexcept {
         const MutexLock lock(busy_);
         error_ = error;

@@ -1,7 +1,7 @@
 #pragma once
 
-// Host memory that loses its contents when it grows. The counterpart on devices is
-// DeviceBuffer (device.h).
+// Host memory that may lose its contents when it grows. DeviceBuffer (device.h) is the
+// counterpart on devices.
 
 #include <cstddef>
 #include <new>
@@ -12,7 +12,7 @@
 
 namespace v3dg {
 
-// An array of a plain type, not initialised. When it grows, the contents are lost.
+// An uninitialised array of a plain type. When it grows, its contents are lost.
 template <class T>
 class Buffer {
   public:

@@ -1,6 +1,6 @@
 #pragma once
 
-// Asynchronous copies from device memory to shared memory, which use no registers.
+// Asynchronous copies from device memory to shared memory. They do not need registers.
 
 #include <cuda_runtime.h>
 

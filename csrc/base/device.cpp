@@ -84,7 +84,7 @@ bool can_start_early(const void* kernel) {
     return found->second;
 }
 
-// A separate pool, so that no other library determines how long memory is kept.
+// v3dg has its own pool, so that other libraries cannot change how long memory is kept.
 static cudaMemPool_t pool_of_current_device() {
     static Mutex mutex;
     static std::vector<cudaMemPool_t> pools V3DG_GUARDED_BY(mutex);
@@ -98,7 +98,7 @@ static cudaMemPool_t pool_of_current_device() {
         properties.location.id = device;
         cudaMemPool_t pool;
         check(cudaMemPoolCreate(&pool, &properties), "cudaMemPoolCreate");
-        // The pool keeps up to 1 GiB of freed memory, because mapping it again takes
+        // Keep up to 1 GiB of freed memory in the pool, because mapping it again takes
         // milliseconds.
         uint64_t keep = uint64_t(1) << 30;
         check(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &keep),
@@ -124,8 +124,8 @@ void* allocate(size_t bytes, cudaStream_t stream) {
     void* pointer = nullptr;
     cudaError_t error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
     if (error == cudaErrorMemoryAllocation) {
-        // Try again. The pool's free memory may be fragmented, and work on other
-        // streams may free more.
+        // Try again after waiting. The pool's free memory may be fragmented, and work
+        // on other streams may free more.
         cudaGetLastError();
         check(cudaDeviceSynchronize(), "cudaDeviceSynchronize");
         check(cudaMemPoolTrimTo(pool, 0), "cudaMemPoolTrimTo");
@@ -142,7 +142,7 @@ void release(void* pointer, int device, cudaStream_t stream) noexcept {
     int current = device;
     const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
                               cudaSetDevice(device) == cudaSuccess;
-    // Ignore errors. At exit the driver may be unloaded already, which frees the
+    // Ignore errors. At exit, the driver may be unloaded already; it has then freed the
     // memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
@@ -177,12 +177,14 @@ StreamMutex::StreamMutex() {
 
 StreamMutex::~StreamMutex() {
     if (cudaEventDestroy(done_) != cudaSuccess)
-        cudaGetLastError();  // ignore: at exit, the driver may be unloaded already
+        cudaGetLastError();  // ignore errors, because at exit the driver may be
+                             // unloaded already
 }
 
 void StreamMutex::wait() const noexcept {
     if (cudaEventSynchronize(done_) != cudaSuccess)
-        cudaGetLastError();  // ignore: at exit, the driver may be unloaded already
+        cudaGetLastError();  // ignore errors, because at exit the driver may be
+                             // unloaded already
 }
 
 void StreamMutex::acquire(cudaStream_t stream, bool is_captured) {
@@ -203,8 +205,8 @@ void StreamMutex::release(cudaStream_t stream, bool is_captured) noexcept {
     busy_.unlock();
 }
 
-// The constructor and the destructor only call functions, because Clang's thread-safety
-// analysis skips constructors and destructors.
+// The constructor and the destructor only call other functions, because Clang's
+// thread-safety analysis skips constructors and destructors.
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)
     : mutex_(mutex), stream_(stream), is_captured_(is_capturing(stream)) {
     mutex.acquire(stream, is_captured_);

@@ -18,7 +18,7 @@
 namespace v3dg {
 namespace cuda {
 
-// The error for a lack of device memory. what() has the requested and the free bytes.
+// The error for too little device memory. what() has the requested and the free bytes.
 // Like every std::bad_alloc, it becomes a MemoryError in Python.
 class OutOfMemory : public std::bad_alloc {
   public:
@@ -33,7 +33,7 @@ class OutOfMemory : public std::bad_alloc {
 // the call.
 void check(cudaError_t error, const char* what);
 
-// Returns the number of devices; 0 without a driver.
+// Returns the number of devices, or 0 if there is no driver.
 int num_devices();
 int current_device();
 // Returns the number of multiprocessors of the current device.
@@ -42,33 +42,34 @@ unsigned num_multiprocessors();
 // Returns the bytes of shared memory of a multiprocessor.
 size_t shared_memory_of_multiprocessor();
 
-// Allows a kernel to use `bytes` of dynamic shared memory on the current device. A
-// kernel needs this call if its dynamic and static shared memory together exceed 48
-// KiB. The limit of a kernel is shared by all threads and never lowered, because
-// another thread may be about to launch the kernel. `name` is for error texts.
+// Allows a kernel to use `bytes` of dynamic shared memory on the current device. This
+// is needed if its dynamic and static shared memory together exceed 48 KiB. All threads
+// share the limit of a kernel. It is never lowered, because another thread may be about
+// to launch the kernel. `name` is used in error texts.
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
 
-// Returns whether the kernel, as compiled for the current device, waits for the kernel
-// before it (launch_early()).
+// Returns whether the kernel, as compiled for the current device, can start before the
+// preceding kernel has ended (launch_early()).
 bool can_start_early(const void* kernel);
 
-// Returns stream-ordered memory of the current device. The pool keeps freed memory for
-// later calls. Throws OutOfMemory.
+// Allocates memory of the current device, in the order of the stream. The pool keeps
+// freed memory for later calls. Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);
-// Frees memory of `device` on a stream of that device. Any device may be current.
+// Frees memory of `device` in the order of a stream of that device. Another device may
+// be current.
 void release(void* pointer, int device, cudaStream_t stream) noexcept;
 // Waits for the stream, then returns free memory of the pool to the driver.
 void trim_pool(cudaStream_t stream);
 
-// The memory that the pool of the current device holds, and how much of it is in use.
+// How much memory the pool of the current device holds, and how much of it is in use.
 struct PoolBytes {
     size_t reserved, used;
 };
 PoolBytes pool_bytes();
 
-// While this object exists, calls of this thread that free memory or destroy events do
-// not invalidate a graph that another stream is capturing. An object that is replaced
-// during a capture is destroyed then.
+// Protects captures. While this object exists, calls of this thread that free memory or
+// destroy events do not invalidate a graph that another stream is capturing. They occur
+// if an object is replaced during a capture.
 class KeepsCaptures {
   public:
     KeepsCaptures() { exchange(); }
@@ -83,11 +84,11 @@ class KeepsCaptures {
 };
 
 bool is_capturing(cudaStream_t stream);
-// Throws std::runtime_error if the stream is being captured. Memory cannot be allocated
-// then, because memory that a graph allocates is freed with the graph.
+// Throws std::runtime_error if the stream is being captured. During a capture, memory
+// cannot be allocated, because it would be freed together with the graph.
 void refuse_capture(cudaStream_t stream);
 
-// A mutex for memory that several threads and streams use in turn.
+// A mutex for memory that different threads and streams use one after another.
 class StreamMutex {
   public:
     StreamMutex();
@@ -108,7 +109,7 @@ class StreamMutex {
     cudaStream_t last_ V3DG_GUARDED_BY(busy_) = nullptr;
 };
 
-// Holds a StreamMutex. No other thread can hold it meanwhile. Work that this thread
+// Holds a StreamMutex, which no other thread can hold meanwhile. Work that this thread
 // enqueues on `stream` runs after the work that was enqueued under the previous lock.
 // Captured work is not ordered; the code that replays the graph must order it.
 class V3DG_SCOPED_CAPABILITY StreamLock {
@@ -124,9 +125,9 @@ class V3DG_SCOPED_CAPABILITY StreamLock {
     bool is_captured_;
 };
 
-// An array of a plain type, not initialised, on the device that is current when it
-// grows. When it grows, the contents are lost. Users of several streams must order
-// their work.
+// An uninitialised array of a plain type, on the device that is current when it grows.
+// When it grows, its contents are lost. If several streams use it, the caller must
+// order their work.
 template <class T>
 class DeviceBuffer {
   public:
@@ -155,7 +156,7 @@ class DeviceBuffer {
         stream_ = stream;
         return data_;
     }
-    // Copies elements from the host. The caller may reuse host memory on return.
+    // Copies elements from host memory, which may be reused when the function returns.
     T* copy_from(Span<const T> host, cudaStream_t stream) {
         reserve(host.size, stream);
         if (host.size > 0)

@@ -7,8 +7,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Makes a device current in this thread during its lifetime. Streams that are used
-// meanwhile must belong to the device.
+// Makes a device current in this thread until the end of the scope. All streams that
+// are used in the scope must belong to this device.
 class DeviceGuard {
   public:
     explicit DeviceGuard(int device) : device_(device), before_(current_device()) {

@@ -7,7 +7,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Owns an event without timing. An event that was never recorded counts as completed.
+// Owns an event that does not measure time. An event that was never recorded counts as
+// completed.
 class Event {
   public:
     Event() {
@@ -24,8 +25,8 @@ class Event {
     void hold_back(cudaStream_t stream) const {
         check(cudaStreamWaitEvent(stream, event_, 0), "cudaStreamWaitEvent");
     }
-    // Returns whether the device has reached the event, without waiting. Throws if
-    // earlier work failed; the error text names `work`.
+    // Returns whether the device has reached the event. Does not wait. Throws if
+    // earlier work failed; `work` names that work in the error text.
     bool has_happened(const char* work) const {
         const cudaError_t state = cudaEventQuery(event_);
         if (state == cudaErrorNotReady) return false;

@@ -1,6 +1,6 @@
 #pragma once
 
-// The transport of exceptions out of parallel loops.
+// Transfers exceptions out of parallel loops.
 
 #include <cstddef>
 #include <exception>
@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// Carries an exception out of a parallel loop. If there are several, the one with the
-// lowest index counts.
+// Transfers an exception out of a parallel loop. If several are thrown, the one with
+// the lowest index is kept.
 class FirstError {
   public:
     template <class Body>
@@ -21,15 +21,15 @@ class FirstError {
             keep_lowest(index, std::current_exception());
         }
     }
-    // Rethrows the exception, if any. Call this after the loop.
+    // Rethrows the exception if there is one. Call this after the loop.
     void rethrow() {
         const MutexLock lock(mutex_);
         if (error_) std::rethrow_exception(error_);
     }
 
   private:
-    // The lock is not in the catch block, because Clang's thread-safety analysis skips
-    // catch blocks.
+    // The mutex is not locked in the catch block, because Clang's thread-safety
+    // analysis skips catch blocks.
     void keep_lowest(size_t index, const std::exception_ptr& error) noexcept {
         const MutexLock lock(mutex_);
         if (error_ && index >= index_) return;

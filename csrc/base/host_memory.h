@@ -13,9 +13,9 @@
 
 namespace v3dg {
 
-// Returns memory that is aligned to a cache line, or null. free_pages() releases it.
-// Large blocks use huge pages if the system supports them, because scattered reads
-// would otherwise wait for the page table.
+// Returns memory that is aligned to a cache line, or null if there is none.
+// free_pages() releases it. If the system supports it, large blocks use huge pages,
+// because scattered reads would otherwise wait for page table look-ups.
 inline void* allocate_pages(size_t bytes) {
     constexpr size_t kHugePage = size_t(2) << 20;
     const size_t alignment = bytes < 2 * kHugePage ? 64 : kHugePage;

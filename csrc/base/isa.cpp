@@ -24,14 +24,14 @@ const char* isa_name(Isa isa) {
 
 #if defined(__x86_64__)
 
-// The extensions that compilers use with -march=x86-64-v3 and -march=x86-64-v4.
+// The CPU features that compilers use with -march=x86-64-v3 and -march=x86-64-v4.
 struct Extensions {
     bool v3, v4;
 };
 
 #if defined(_WIN32)
-// Windows' C++ runtime lacks what __builtin_cpu_supports() reads. The operating system
-// must save the wide registers, too.
+// On Windows, the C++ runtime does not support __builtin_cpu_supports(), so query the
+// CPU directly. The operating system must also save the wide registers.
 __attribute__((target("xsave"))) static Extensions extensions() {
     int basic[4], extended[4];
     __cpuid(basic, 0);

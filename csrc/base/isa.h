@@ -1,16 +1,17 @@
 #pragma once
 
-// Sources that are compiled once per instruction set, and the choice between the
-// results.
+// For sources that are compiled once per instruction set: the choice of the instruction
+// set at run time.
 
 namespace v3dg {
 
 // The instruction sets for which the sources in V3DG_SIMD_SOURCES are compiled.
 enum class Isa { baseline, avx2, avx512 };
 
-// Returns the widest instruction set of this processor, or the one that the environment
-// variable V3DG_ISA names. The variable is read once. Throws std::runtime_error if the
-// variable is wrong, or the processor lacks the instruction set.
+// Returns the instruction set that the environment variable V3DG_ISA names or, without
+// it, the widest one of this processor. The variable is read once. Throws
+// std::runtime_error if its value is invalid, or if the processor does not support that
+// instruction set.
 Isa active_isa();
 const char* isa_name(Isa isa);
 

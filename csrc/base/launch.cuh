@@ -1,7 +1,6 @@
 #pragma once
 
-// Launches kernels. The file also has the helpers for blocks and warps that most
-// kernels use.
+// Launches kernels. Also has the functions for blocks and warps that most kernels use.
 
 #include "base/device.h"
 
@@ -10,8 +9,8 @@ namespace cuda {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-// Launches `kernel` and checks for errors. `name` is for error texts. Does nothing if
-// the grid has no blocks.
+// Launches `kernel` and checks for errors. `name` is used in error texts. If the grid
+// has no blocks, does nothing.
 template <class... P, class... A>
 void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_t shared_bytes,
             cudaStream_t stream, A&&... arguments) {
@@ -64,14 +63,15 @@ __device__ inline unsigned char* shared_memory() {
 }
 
 // Returns, in lane 0, the index of the next work item of a warp. The first `dealt`
-// items are assigned statically. `taken` is a counter, initially 0, of the items that
-// are assigned here. Call this early, because the atomic operation has a long latency.
+// items are assigned statically, and `taken` counts the items that are assigned here.
+// It must initially be 0. Call this function early, because the atomic operation has a
+// long latency.
 __device__ inline unsigned take_next(unsigned* taken, unsigned dealt) {
     return threadIdx.x % 32 == 0 ? dealt + atomicAdd(taken, 1u) : 0;
 }
 
-// Return the sum, and the minimum, over the lanes of a warp, in every lane. The order
-// of additions is fixed. All lanes of the warp must call them.
+// Return the sum and the minimum over the lanes of a warp, in every lane. The order of
+// additions is fixed. All lanes of the warp must call them.
 template <class T>
 __device__ inline T warp_sum(T x) {
 #pragma unroll

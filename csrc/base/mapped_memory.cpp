@@ -1,5 +1,5 @@
-// Implements mapped_memory.h with functions of the driver, which the runtime finds. So
-// the module also loads on machines without a driver.
+// Implements mapped_memory.h with functions of the driver. They are looked up through
+// the runtime, so that the module also loads on machines without a driver.
 
 #include "base/mapped_memory.h"
 
@@ -37,7 +37,8 @@ void find(const char* name, F& function) {
     void* found = nullptr;
     cudaDriverEntryPointQueryResult result = cudaDriverEntryPointSymbolNotFound;
 #if CUDART_VERSION >= 12050
-    constexpr unsigned kVersion = 11020;  // of CUDA, in which all functions exist
+    constexpr unsigned kVersion = 11020;  // a CUDA version in which all of these
+                                          // functions exist
     const cudaError_t error =
         cudaGetDriverEntryPointByVersion(name, &found, kVersion, cudaEnableDefault, &result);
 #else
@@ -98,7 +99,7 @@ CUmemGenericAllocationHandle create_memory(size_t bytes, int device, cudaStream_
     CUmemGenericAllocationHandle memory = 0;
     CUresult result = driver().create(&memory, bytes, &properties, 0);
     if (result == CUDA_ERROR_OUT_OF_MEMORY) {
-        // Try again. The pool may have free memory.
+        // Try again, because the pool may have free memory after waiting.
         check(cudaDeviceSynchronize(), "cudaDeviceSynchronize");
         trim_pool(stream);
         result = driver().create(&memory, bytes, &properties, 0);
@@ -112,7 +113,7 @@ CUmemGenericAllocationHandle create_memory(size_t bytes, int device, cudaStream_
 void map_memory(CUdeviceptr at, size_t bytes, int device, cudaStream_t stream) {
     const CUmemGenericAllocationHandle memory = create_memory(bytes, device, stream);
     const CUresult mapped = driver().map(at, bytes, 0, memory, 0);
-    // The mapping keeps the memory.
+    // The mapping keeps the memory alive.
     driver().release(memory);
     check_driver(mapped, "cuMemMap");
     CUmemAccessDesc access{};
@@ -157,7 +158,7 @@ void* MappedMemory::reserve(size_t bytes, cudaStream_t stream) {
 MappedMemory::~MappedMemory() {
     if (first_ == 0) return;
     const KeepsCaptures keeps_captures;
-    // Ignore errors. At exit the driver may be unloaded already, which frees the
+    // Ignore errors. At exit, the driver may be unloaded already; it has then freed the
     // memory.
     CUdeviceptr piece = first_;
     for (const size_t bytes : piece_bytes_) {

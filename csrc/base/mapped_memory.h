@@ -1,10 +1,12 @@
 #pragma once
 
-// Device memory that grows without moving, for buffers whose size follows a camera.
+// Device memory that grows without moving, for buffers whose size changes when the
+// camera moves.
 //
-// To grow, a buffer of a pool must be freed and a larger one allocated, which takes as
-// long as drawing several frames. Here a buffer has a range of addresses as large as
-// the memory of the device, and memory is mapped behind the part that is in use.
+// To grow a buffer of a pool, it must be freed and a larger one allocated, which takes
+// as long as drawing several frames. A buffer of this file reserves as many addresses
+// as the device has memory. When it grows, more memory is mapped after the part that is
+// in use.
 
 #include <vector>
 
@@ -13,7 +15,7 @@
 namespace v3dg {
 namespace cuda {
 
-// A range of addresses, the first bytes() of which have memory of the device that
+// A range of addresses. The first bytes() of it are mapped to memory of the device that
 // was current in the first call of reserve().
 class MappedMemory {
   public:
@@ -30,8 +32,8 @@ class MappedMemory {
     static bool is_supported();
 
     // Makes room for `bytes`. The address stays the same, so work in progress is not
-    // affected. `stream` is a stream of the device. Throws OutOfMemory; memory that was
-    // reserved before stays reserved.
+    // affected. `stream` must belong to the device. Throws OutOfMemory; memory that was
+    // reserved earlier then stays reserved.
     void* reserve(size_t bytes, cudaStream_t stream);
     void* data() const { return reinterpret_cast<void*>(first_); }
     size_t bytes() const { return num_bytes_; }
@@ -39,15 +41,17 @@ class MappedMemory {
   private:
     void swap(MappedMemory& other) noexcept;
 
-    unsigned long long first_ = 0;  // address
+    unsigned long long first_ = 0;  // address of the range
     size_t range_bytes_ = 0;
     size_t num_bytes_ = 0;
-    std::vector<size_t> piece_bytes_;  // of memory that was mapped together
+    std::vector<size_t> piece_bytes_;  // sizes of the pieces of memory that were mapped
+                                       // together
     int device_ = 0;
 };
 
-// Like DeviceBuffer, but reserve() does not move an array that is `in_place`. An
-// array that is not in place, as on devices that cannot map memory, is a DeviceBuffer.
+// Like DeviceBuffer, but reserve() does not move an array that is `in_place`. An array
+// that is not in place is a DeviceBuffer. This is always the case on devices that
+// cannot map memory.
 template <class T>
 class GrowingBuffer {
   public:
@@ -59,8 +63,8 @@ class GrowingBuffer {
         if (size * sizeof(T) > mapped_.bytes()) refuse_capture(stream);
         return static_cast<T*>(mapped_.reserve(size * sizeof(T), stream));
     }
-    // Frees the memory. Precondition, if the array is in place: the device has finished
-    // the work that uses it.
+    // Frees the memory. Precondition for an array in place: the device has finished the
+    // work that uses it.
     void release() {
         const MappedMemory mapped = std::move(mapped_);
         const DeviceBuffer<T> moving = std::move(moving_);

@@ -1,8 +1,8 @@
 #pragma once
 
 // The mutex, locks and condition variable of the standard library, with the annotations
-// of base/thread_annotations.h. WebAssembly without threads has a mutex that does
-// nothing, and no condition variable.
+// of base/thread_annotations.h. In WebAssembly without threads, the mutex does nothing,
+// and there is no condition variable.
 
 #if defined(__wasm__) && !defined(__wasm_atomics__)
 #define V3DG_HAS_THREADS 0
@@ -46,7 +46,8 @@ class V3DG_CAPABILITY("mutex") Mutex {
 class V3DG_SCOPED_CAPABILITY MutexLock {
   public:
     explicit MutexLock(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { mutex.lock(); }
-    // Takes over a mutex that the caller holds; releases it at the end of the scope.
+    // Takes over a mutex that the caller has locked, and unlocks it at the end of the
+    // scope.
     MutexLock(Mutex& mutex, std::adopt_lock_t) V3DG_REQUIRES(mutex) : mutex_(mutex) {}
     ~MutexLock() V3DG_RELEASE() { mutex_.unlock(); }
     MutexLock(const MutexLock&) = delete;
@@ -56,8 +57,8 @@ class V3DG_SCOPED_CAPABILITY MutexLock {
     Mutex& mutex_;
 };
 
-// Releases a mutex that the caller holds, and acquires it again at the end of the
-// scope, also after an exception.
+// Unlocks a mutex that the caller has locked, and locks it again at the end of the
+// scope, even after an exception.
 class V3DG_SCOPED_CAPABILITY MutexUnlock {
   public:
     explicit MutexUnlock(Mutex& mutex) V3DG_RELEASE(mutex) : mutex_(mutex) { mutex.unlock(); }
@@ -71,8 +72,8 @@ class V3DG_SCOPED_CAPABILITY MutexUnlock {
 
 #if V3DG_HAS_THREADS
 // A condition variable. Waits may end without a notification. There is no wait with a
-// predicate: callers test their condition in a loop, so that clang checks its accesses,
-// too.
+// predicate: callers test their condition in a loop, so that clang also checks how the
+// condition accesses guarded fields.
 class Condition {
   public:
     using Time = std::chrono::steady_clock::time_point;

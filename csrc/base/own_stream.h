@@ -13,7 +13,8 @@ class OwnStream {
     OwnStream() {
         check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "cudaStreamCreate");
     }
-    // Waits for the stream: its work may read memory of the owner, also after an error.
+    // Waits for the stream, because its work may still read memory of the owner, even
+    // after an error.
     ~OwnStream() {
         cudaStreamSynchronize(stream_);
         cudaStreamDestroy(stream_);

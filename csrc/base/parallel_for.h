@@ -15,10 +15,9 @@
 
 namespace v3dg {
 
-// Calls body(i) for every i < count on at most `num_threads` threads, whose
-// thread_index() is less. Each thread claims `chunk` consecutive indices at a time.
-// Results must not depend on which thread calls body. Exceptions of body, mostly out of
-// memory, are rethrown.
+// Calls body(i) for every i < count on at most `num_threads` threads; thread_index() is
+// less than that number. Each thread claims `chunk` consecutive indices at a time.
+// Results must not depend on which thread calls body. Exceptions of body are rethrown.
 template <class Body>
 void parallel_for_on(int num_threads, size_t count, size_t chunk, const Body& body) {
     FirstError error;
@@ -29,7 +28,7 @@ void parallel_for_on(int num_threads, size_t count, size_t chunk, const Body& bo
         });
     };
     if (most_threads() == 1) {
-        // Run without an OpenMP region: OpenMP ends the process if it has no memory for
+        // Do not use OpenMP here, because it ends the process if it has no memory for
         // threads.
         for (size_t first = 0; first < count; first += chunk) run(first);
     } else {

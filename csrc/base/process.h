@@ -1,6 +1,6 @@
 #pragma once
 
-// The process: its number, and what must happen when it forks.
+// The number of the process, and functions that run when it forks.
 
 #include <cstdint>
 
@@ -9,8 +9,9 @@ namespace v3dg {
 // Returns the number of this process. A child of fork() has another number.
 int64_t process_id();
 
-// Calls `before` in the parent before a fork(), and `in_child` in the child after it;
-// either may be null. Does nothing on systems without fork(). Throws std::bad_alloc.
+// Registers functions for fork(): `before` is called in the parent before it, and
+// `in_child` in the child after it. Either may be null. Does nothing on systems without
+// fork(). Throws std::bad_alloc.
 void at_fork(void (*before)(), void (*in_child)());
 
 // Sleeps until the process ends.

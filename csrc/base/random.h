@@ -10,7 +10,7 @@ namespace v3dg {
 
 // Returns random bits that depend only on seed + stream, and on the counter.
 V3DG_HD inline uint64_t random_bits(uint64_t seed, uint64_t stream, uint64_t counter) {
-    // Three rounds of splitmix64; the counter is added in the second round.
+    // Three rounds of splitmix64. The counter is added in the second round.
     uint64_t x = seed;
     const uint64_t more[3] = {stream, counter, 0};
     for (const uint64_t m : more) {

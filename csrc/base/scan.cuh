@@ -20,7 +20,7 @@ __device__ inline T warp_prefix(T x) {
     return x;
 }
 
-// Returns the sum of x over the threads before this one. `total` becomes the sum over
+// Returns the sum of x over the threads before this one. `total` receives the sum over
 // all threads. All threads of a block of whole warps must call it.
 template <class T>
 __device__ inline T block_prefix(T x, T& total) {
@@ -40,7 +40,7 @@ __device__ inline T block_prefix(T x, T& total) {
 }
 
 // Returns the next value of a counter, which starts at 0. All threads of the block must
-// call it, and get the same value.
+// call it, and all get the same value.
 __device__ inline unsigned take_ticket(unsigned* counter) {
     __shared__ unsigned ticket;
     if (threadIdx.x == 0) ticket = atomicAdd(counter, 1u);
@@ -50,16 +50,17 @@ __device__ inline unsigned take_ticket(unsigned* counter) {
     return taken;
 }
 
-// Returns the sum of all parts before `part`. `sum` is the sum of this part, below
-// 2^62. One warp must call it once per part. `state` has one integer per part,
-// initially zero. Parts must be started in ascending order, as by take_ticket().
+// Returns the sum of all parts before `part`. `sum` is the sum of this part, and must
+// be below 2^62. One warp must call it once per part. `state` has one integer per part,
+// initially zero. Parts must be started in ascending order, for example with
+// take_ticket().
 //
 // Source: Merrill and Garland, Single-pass Parallel Prefix Scan with Decoupled
 // Look-back, 2016.
 __device__ inline unsigned long long prefix_of_part(unsigned long long* state, size_t part,
                                                     unsigned long long sum) {
     constexpr unsigned long long kOwn = 1ull << 62, kAll = 2ull << 62, kValue = kOwn - 1;
-    // Parts that a lane reads together, to hide the latency.
+    // Number of parts that a lane reads at once, to hide the latency.
     constexpr unsigned kEach = 4;
     volatile unsigned long long* word = state;
     const unsigned lane = threadIdx.x % 32;
@@ -83,8 +84,8 @@ __device__ inline unsigned long long prefix_of_part(unsigned long long* state, s
 #pragma unroll
             for (unsigned k = 0; k < kEach; ++k) is_ready = is_ready && seen[k] >= kOwn;
         } while (!is_ready);
-        // Each lane adds up its parts backwards, as far as the nearest part that has
-        // published the sum of all parts up to itself.
+        // Each lane sums its parts backwards, up to the nearest part that has published
+        // the sum of all parts including itself.
 #pragma unroll
         for (unsigned k = 0; k < kEach; ++k) {
             of_lane += knows_all ? 0 : seen[k] & kValue;

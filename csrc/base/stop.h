@@ -1,6 +1,6 @@
 #pragma once
 
-// Requests to stop long work.
+// Requests to stop work that takes long.
 
 #include <atomic>
 

@@ -1,6 +1,6 @@
 #pragma once
 
-// CUDA's stream type, for headers that sources without CUDA include, too.
+// CUDA's stream type, for headers that are also included by sources without CUDA.
 
 struct CUstream_st;
 

@@ -1,9 +1,9 @@
 #pragma once
 
-// Annotations for Clang's thread-safety analysis: which mutex guards a field, and which
-// mutex a function needs.
+// Annotations for Clang's thread-safety analysis. They tell which mutex guards a field,
+// and which mutex a function needs.
 //
-// Clang checks them with -Wthread-safety (.ci/check_threads.py). For other compilers
+// Clang checks them with -Wthread-safety (.ci/check_threads.py). For other compilers,
 // they are empty. base/mutex.h has the annotated types.
 
 #if defined(__clang__)
@@ -23,8 +23,8 @@
 #define V3DG_REQUIRES(...) V3DG_THREAD_ATTRIBUTE(requires_capability(__VA_ARGS__))
 #define V3DG_EXCLUDES(...) V3DG_THREAD_ATTRIBUTE(locks_excluded(__VA_ARGS__))
 
-// Mark a function that acquires the mutex, that releases it, or that acquires it if it
-// returns `success`.
+// Mark a function that locks the mutex, that unlocks it, or that locks it if it returns
+// `success`.
 #define V3DG_ACQUIRE(...) V3DG_THREAD_ATTRIBUTE(acquire_capability(__VA_ARGS__))
 #define V3DG_RELEASE(...) V3DG_THREAD_ATTRIBUTE(release_capability(__VA_ARGS__))
 #define V3DG_TRY_ACQUIRE(success, ...) \

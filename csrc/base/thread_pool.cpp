@@ -1,8 +1,8 @@
-// The threads of parallel loops without OpenMP: a pool that loops of all threads share.
+// The threads of parallel loops without OpenMP. All loops share one pool of threads.
 //
-// A loop runs on the thread that starts it, and on the idle threads of the pool. So it
-// ends even if the pool has no thread, and nested loops need no others: they run on
-// their own thread alone, as with OpenMP.
+// A loop runs on the thread that starts it and on the idle threads of the pool, so it
+// ends even if the pool has no threads. A nested loop runs only on its own thread, as
+// with OpenMP.
 
 #ifndef _OPENMP
 
@@ -55,15 +55,16 @@ struct Loop {
 
 class ThreadPool {
   public:
-    // Returns the pool of this process. The pool of a parent process is not used in a
-    // child of fork(), which has none of its threads; nor is it destroyed there.
+    // Returns the pool of this process. In a child of fork(), the pool of the parent is
+    // not used, because its threads do not exist there. It is not destroyed there
+    // either.
     static ThreadPool& of_process() {
         static std::atomic<ThreadPool*> pool{nullptr};
         ThreadPool* current = pool.load();
         if (current != nullptr && current->process_ == process_id()) return *current;
         auto made = std::make_unique<ThreadPool>();
         if (pool.compare_exchange_strong(current, made.get())) return *made.release();
-        return *current;  // another thread was faster
+        return *current;  // another thread has set it first
     }
 
     void run(Loop& loop) V3DG_EXCLUDES(busy_) {
@@ -80,7 +81,7 @@ class ThreadPool {
     }
 
   private:
-    // Uses the threads that the system can start, if it cannot start as many as needed.
+    // Starts threads until there are `count`, or until the system cannot start more.
     void start_threads(int count) V3DG_REQUIRES(busy_) {
         try {
             for (; num_threads_ < count; ++num_threads_) std::thread([this] { help(); }).detach();
@@ -110,7 +111,7 @@ class ThreadPool {
     const int64_t process_ = process_id();
     Mutex busy_;
     Condition has_work_, is_finished_;
-    std::vector<Loop*> loops_ V3DG_GUARDED_BY(busy_);  // those that need more threads
+    std::vector<Loop*> loops_ V3DG_GUARDED_BY(busy_);  // loops that need more threads
     int num_threads_ V3DG_GUARDED_BY(busy_) = 0;
 };
 

@@ -1,4 +1,4 @@
-// The threads of parallel loops with OpenMP. thread_pool.cpp is used without it.
+// The threads of parallel loops with OpenMP. Without OpenMP, thread_pool.cpp is used.
 
 #ifdef _OPENMP
 
@@ -15,14 +15,14 @@ namespace v3dg {
 namespace {
 
 constexpr int kMostThreads = 1024;
-// The limits of a thread's stack size. The median split overflows a stack of 64 KiB. On
-// machines with many processors, the address space is too small for more than the upper
-// limit.
+// Limits for the stack size of a thread. The median split overflows a stack of 64 KiB.
+// On machines with many processors, the address space does not suffice for larger
+// stacks than the upper limit.
 constexpr double kLeastStackBytes = double(256 << 10);
 constexpr double kMostStackBytes = double(1 << 30);
 
 // Returns the bytes of a stack size in OpenMP's notation, such as "512", "64 k" or
-// "2M". A number without a unit is in KiB. Returns 0 for other texts, which OpenMP
+// "2M". A number without a unit is in KiB. Returns 0 for invalid texts, which OpenMP
 // ignores.
 double stack_bytes_of(const char* text) {
     char* end = nullptr;

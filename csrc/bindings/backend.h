@@ -209,8 +209,7 @@ class Frame {
 class AssetFrame {
   public:
     virtual ~AssetFrame() = default;
-    // Like Frame::draw(), for one camera. The channel `clipped` is requested only if
-    // draws_only_plainly is false.
+    // Like Frame::draw(), for one camera.
     virtual std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                                const SensorRequest& sensor,
                                                const std::atomic<bool>* stop) = 0;

@@ -80,10 +80,9 @@ void check_clipped(const SensorRequest& request, const Camera& camera) {
 SensorRequest sensor_of(const py::object& sensor, const Eyes& eyes) {
     if (sensor.is_none()) return {};
     const Window window = window_of(eyes.camera[0]);
-    const SensorRequest request =
-        held<BoundSensor>(sensor, "sensor").request({window.height(), window.width()});
-    if (request.mesh.is_there() && eyes.are_two)
-        throw py::value_error("mesh: expected one camera, got two eyes; draw each eye separately");
+    std::vector<py::ssize_t> shape{window.height(), window.width()};
+    if (eyes.are_two) shape.insert(shape.begin(), 2);
+    const SensorRequest request = held<BoundSensor>(sensor, "sensor").request(shape);
     check_clipped(request, eyes.camera[0]);
     return request;
 }
@@ -139,16 +138,10 @@ struct BoundRequest {
     }
 };
 
-// Throws ValueError if a device cannot draw the channels, or if the mesh is on another
-// device. `sensor` is a BoundSensor or None.
+// Throws ValueError if the mesh is on another device. `sensor` is a BoundSensor or
+// None.
 void check_sensor(Device device, const py::object& sensor) {
-    if (sensor.is_none()) return;
-    const auto& bound = held<BoundSensor>(sensor, "sensor");
-    bound.check_device(device);
-    if (bound.channels().clipped && backend_of(device).traits.draws_only_plainly)
-        throw py::value_error(
-            "channels: 'clipped' is drawn only on the CPU; leave it out, or draw with "
-            "device='cpu'");
+    if (!sensor.is_none()) held<BoundSensor>(sensor, "sensor").check_device(device);
 }
 
 // Draws scenes on one device. The frame's models belong to the bundles of the scenes,
@@ -402,6 +395,8 @@ void bind_frame(py::module_& m) {
                  [](const std::array<double, 3>& background, float min_transmittance,
                     bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
              py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a)
+        .def_readonly("background", &Shade::background)
+        .def_readonly("min_transmittance", &Shade::min_transmittance)
         .def_readonly("with_depth", &Shade::with_depth);
     py::class_<NewPicture>(m, "Picture", "A drawn picture: arrays of colour, alpha and depth.")
         .def_readonly("color", &NewPicture::color)

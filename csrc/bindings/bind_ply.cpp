@@ -127,7 +127,8 @@ PlyEncoding encoding_of(const std::string& name) {
     for (size_t i = 0; i < std::size(kEncodings); ++i)
         if (name == kEncodings[i]) return static_cast<PlyEncoding>(i);
     throw py::value_error(
-        "encoding: expected binary_little_endian, binary_big_endian or ascii, got " + quoted(name));
+        "encoding: expected binary_little_endian, binary_big_endian or ascii, got " +
+        in_quotes(name));
 }
 
 void ply_write(const py::object& path, const py::array& means, const py::array& quats,
@@ -136,7 +137,7 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
     for (const std::string& comment : comments)
         if (comment.find_first_of("\r\n") != std::string::npos)
             throw py::value_error("comments: expected text without line breaks, got " +
-                                  quoted(comment));
+                                  in_quotes(comment));
     const PlyEncoding chosen = encoding_of(encoding);
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;

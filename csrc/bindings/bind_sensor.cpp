@@ -66,6 +66,22 @@ BoundMesh::BoundMesh(py::object color, py::object depth, py::object coverage, py
     layer_.light = is_linear ? MeshLight::linear : MeshLight::display;
 }
 
+BoundMesh BoundMesh::of_eye(int number) const {
+    if (shape_.size() != 3 || shape_[0] != 2)
+        refuse_value("mesh", "expected planes of shape (2, H, W) for two eyes, got " +
+                                 shape_text(arrays_[1]));
+    std::vector<py::object> planes;
+    for (const py::object& array : arrays_)
+        planes.push_back(array.is_none() ? array : py::object(array[py::int_(number)]));
+    return {planes[0],
+            planes[1],
+            planes[2],
+            planes[3],
+            planes[4],
+            planes[5],
+            layer_.light == MeshLight::linear};
+}
+
 void BoundMesh::check(const std::vector<py::ssize_t>& shape) const {
     if (shape_ == shape) return;
     refuse_value("mesh", "expected planes of shape " + shape_text(shape) +
@@ -76,6 +92,12 @@ BoundSensor::BoundSensor(const std::vector<std::string>& channels, py::object me
     : mesh_(std::move(mesh)) {
     for (const std::string& name : channels) channel_of(channels_, name) = true;
     if (!mesh_.is_none()) held<BoundMesh>(mesh_, "mesh");
+}
+
+BoundSensor BoundSensor::of_eye(int number) const {
+    BoundSensor eye = *this;
+    if (!mesh_.is_none()) eye.mesh_ = py::cast(held<BoundMesh>(mesh_, "mesh").of_eye(number));
+    return eye;
 }
 
 SensorRequest BoundSensor::request(const std::vector<py::ssize_t>& shape) const {
@@ -107,7 +129,9 @@ void bind_sensor(py::module_& m) {
              "instance"_a = py::none(), "label"_a = py::none(), "is_linear"_a = false);
     py::class_<BoundSensor>(m, "Sensor", "The channels and the meshes of a request.")
         .def(py::init<const std::vector<std::string>&, py::object>(), "channels"_a,
-             "mesh"_a = py::none());
+             "mesh"_a = py::none())
+        .def("of_eye", &BoundSensor::of_eye, "number"_a,
+             "Return the sensor with the meshes of one of two eyes.");
 }
 
 }  // namespace v3dg

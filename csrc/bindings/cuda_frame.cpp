@@ -267,7 +267,8 @@ FrameSensors new_sensors(const SensorRequest& request, NewPictures& pictures, De
     for (size_t k = 0; k < pictures.size(); ++k) {
         const SensorPlanes planes = pictures[k].channels.allocate(
             device, request.channels, {pictures[k].height, pictures[k].width});
-        sensors[k] = {.planes = planes, .mesh = request.mesh};
+        const auto num_pixels = static_cast<size_t>(pictures[k].height * pictures[k].width);
+        sensors[k] = {.planes = planes, .mesh = request.mesh.from(k * num_pixels)};
     }
     return {.first = sensors[0], .second = sensors[1]};
 }
@@ -379,7 +380,8 @@ class BackendAssetFrame final : public backend::AssetFrame {
         std::unique_ptr<Drawing> drawing =
             frame_.draw(packed.rows(), view_of_world<float>(camera), appearance_.filter_px2,
                         appearance_.antialiased, images.image[0], stream_of(work), &packed.packed(),
-                        images.min_transmittance, place_of(pictures, device_), sensors);
+                        images.min_transmittance, place_of(pictures, device_), sensors,
+                        clipped_pictures(camera, images, sensors));
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), SelectRule{}, nullptr);
     }

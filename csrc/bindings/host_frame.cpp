@@ -175,9 +175,10 @@ struct HostPictures {
             pictures.push_back(picture_in<float>(made.back(), window, shade));
             if (counts) std::swap(pictures.back().depth, pictures.back().count);
             const std::vector<py::ssize_t> shape{window.height(), window.width()};
+            const size_t num_pixels = static_cast<size_t>(shape[0] * shape[1]);
             sensors.push_back(
                 {.planes = made.back().channels.allocate(kHost, sensor.channels, shape),
-                 .mesh = sensor.mesh});
+                 .mesh = sensor.mesh.from(static_cast<size_t>(k) * num_pixels)});
         }
     }
     Span<const Sensor> sensor_span() const { return {sensors.data(), sensors.size()}; }

@@ -33,6 +33,9 @@ class BoundMesh {
 
     Device device() const { return device_; }
     const MeshLayer& layer() const { return layer_; }
+    // Returns the layer of one of two eyes. Throws ValueError unless the shape is
+    // (2, H, W).
+    BoundMesh of_eye(int number) const;
     // Throws ValueError unless a plane has this shape.
     void check(const std::vector<py::ssize_t>& shape) const;
 
@@ -50,6 +53,8 @@ class BoundSensor {
     BoundSensor(const std::vector<std::string>& channels, py::object mesh);
 
     const Channels& channels() const { return channels_; }
+    // Returns the sensor with the meshes of one of two eyes.
+    BoundSensor of_eye(int number) const;
     // Returns the request for planes of this shape. Throws ValueError if the mesh has
     // another shape.
     SensorRequest request(const std::vector<py::ssize_t>& shape) const;

@@ -1,6 +1,7 @@
-// Opens bundles with the checks of the Python reader (v3dg/bundle/bundle.py), in its
-// order: the structure of the file, the tables, and then their hash. An error of the
-// hash is preferred to one of the tables, because most wrong tables are damaged files.
+// Opens bundles with the checks of the Python reader (v3dg/bundle/bundle.py), in the
+// same order: the structure of the file, the tables, and then their hash. If both a
+// table and the hash are wrong, the error about the hash is reported, because most
+// wrong tables are damaged files.
 
 #include "c_interface/bundle.h"
 
@@ -29,7 +30,8 @@ std::string shown(T value) {
         return std::to_string(value);
 }
 
-// Returns `width` values of a row of a table, as Python shows them. Row -1 is the last.
+// Returns `width` values of a row of a table, formatted as in Python. Row -1 is the
+// last row.
 template <class T>
 std::string row_text(Span<const T> values, int64_t row, size_t width) {
     const size_t number = row < 0 ? values.size / width - 1 : static_cast<size_t>(row);
@@ -42,7 +44,7 @@ std::string row_text(Span<const T> values, int64_t row, size_t width) {
 
 }  // namespace
 
-// The open file. It is closed with this object; readers have descriptors of their own.
+// The open file. It is closed with this object. Readers duplicate its descriptor.
 class OpenBundle::File {
   public:
     explicit File(const std::string& path)

@@ -1,6 +1,6 @@
 #pragma once
 
-// A bundle whose file is open: its tables in memory, its pages on the disk.
+// A bundle whose file is open. Its tables are in memory, and its pages in the file.
 
 #include <memory>
 #include <string>
@@ -13,10 +13,10 @@
 
 namespace v3dg {
 
-// Any number of threads may use it. It never changes.
+// The object never changes, so any number of threads may use it.
 class OpenBundle {
   public:
-    // Opens a file, and reads, checks and verifies its header and its tables. Throws
+    // Opens a file, and reads and checks its header, its tables, and their hash. Throws
     // Fault.
     explicit OpenBundle(const std::string& path);
     OpenBundle(const OpenBundle&) = delete;
@@ -28,7 +28,7 @@ class OpenBundle {
     size_t num_pages() const { return header_.num_pages; }
     size_t num_levels() const;
     int32_t level_of_cluster(size_t cluster) const { return level_[cluster]; }
-    // Returns the group that made all clusters of the group above, or -1.
+    // Returns the group above, which replaces the clusters that `group` makes, or -1.
     int32_t parent_of_group(size_t group) const { return parent_[group]; }
     // Returns the offset of a page's first byte in the file. If `page` is the number of
     // pages, this is the end of the last page.
@@ -47,7 +47,7 @@ class OpenBundle {
     void make_pages(const std::string& path, const File& file);
 
     BundleHeader header_;
-    Buffer<uint64_t> message_;  // the header, the tables and their hash
+    Buffer<uint64_t> message_;  // the header and the tables, followed by their hash
     std::unique_ptr<HostTable> host_;
     std::unique_ptr<PageSource> pages_;
     Span<const int32_t> level_, parent_;

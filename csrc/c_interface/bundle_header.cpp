@@ -1,5 +1,5 @@
-// Checks the header of a bundle in the order and with the words of the Python reader
-// (v3dg/bundle/file.py), and computes where its tensors are.
+// Checks the header of a bundle, in the order and with the error texts of the Python
+// reader (v3dg/bundle/file.py). Also computes where its tensors are.
 
 #include "c_interface/bundle_header.h"
 
@@ -24,7 +24,7 @@ constexpr uint64_t kFloatAlignment = 4096;
 
 enum class Rows { clusters, clusters_and_end, groups, pages };
 
-// A table of the file: its dtype, and the bytes and the shape of a row.
+// A table of the file: its dtype, and the size and the shape of a row.
 struct TableKind {
     const char* name;
     const char* dtype;
@@ -181,8 +181,8 @@ class HeaderReader {
         check_entry(root, table.name, table.dtype, table.value_bytes, shape);
     }
 
-    // Compares the entry of a tensor with the one that follows from its shape and from
-    // the tensors before it.
+    // Compares the entry of a tensor in the header with the expected one, which follows
+    // from its shape and from the tensors before it.
     void check_entry(const Json& root, const std::string& name, const std::string& dtype,
                      uint64_t value_bytes, const std::vector<uint64_t>& shape) {
         uint64_t size = value_bytes;
@@ -228,7 +228,7 @@ class HeaderReader {
             if (out_.parts.count(member.key) == 0 && member.key != "__metadata__")
                 unknown.insert(member.key);
         if (unknown.empty()) return;
-        fail(quoted(*unknown.begin()) + ": expected only tensors of version " +
+        fail(in_quotes(*unknown.begin()) + ": expected only tensors of version " +
              std::to_string(out_.version) + ", got another one");
     }
 
@@ -250,7 +250,7 @@ class HeaderReader {
     const std::string& path_;
     const uint64_t num_bytes_;
     uint64_t pages_bytes_ = 0;
-    uint64_t end_ = 0;  // of the tensors that were compared
+    uint64_t end_ = 0;  // end of the tensors that were compared
     BundleHeader out_;
 };
 

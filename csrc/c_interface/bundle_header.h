@@ -1,6 +1,6 @@
 #pragma once
 
-// The header of a bundle's file (docs/format.md), which may be hostile.
+// The header of a bundle's file (docs/format.md). The file may be malicious.
 
 #include <cstdint>
 #include <map>
@@ -20,7 +20,8 @@ struct BundleHeader {
     int version = 0;
     int sh_degree = 0;
     PageCodec codec = PageCodec::float32;
-    std::string up;  // the axis that the bundle's config declares as up, or empty
+    std::string up;  // the axis that points up, as the bundle's config declares it, or
+                     // empty
     size_t num_clusters = 0, num_groups = 0, num_pages = 0;
     uint64_t data_start = 0;                // first byte after the header
     std::map<std::string, FilePart> parts;  // tensors by their names
@@ -28,22 +29,22 @@ struct BundleHeader {
     uint64_t pages_bytes() const { return parts.at("pages").end; }
     // Pages begin at multiples of this number of bytes.
     uint64_t alignment() const;
-    // Return the bytes of a page for each gaussian and each cluster.
+    // Return the number of bytes of a page for each gaussian and for each cluster.
     uint64_t gaussian_bytes() const;
     uint64_t cluster_bytes() const;
-    // Returns the bytes of a page, including padding.
+    // Returns the number of bytes of a page, including padding.
     uint64_t page_bytes(uint64_t num_gaussians, uint64_t num_clusters) const;
 };
 
 constexpr uint64_t kMostHeaderBytes = uint64_t(1) << 20;
 
-// Sizes that follow from the counts of smaller files fit into 64 bits.
+// For smaller files, all sizes that follow from the counts fit into 64 bits.
 constexpr uint64_t kMostFileBytes = uint64_t(1) << 48;
 
-// Parses the JSON of a header. `path` is the file's name in messages, `num_bytes` is
-// its size, below kMostFileBytes. Throws Fault unless the header follows from its own
-// counts and fits the size of the file. So all parts lie within the file, one after
-// another.
+// Parses the JSON of a header. `path` is the name of the file in messages, and
+// `num_bytes` its size, which must be below kMostFileBytes. Throws Fault unless the
+// header agrees with its own counts and with the size of the file. Therefore all parts
+// lie inside the file, one after another.
 BundleHeader read_bundle_header(const std::string& path, std::string_view text, uint64_t data_start,
                                 uint64_t num_bytes);
 

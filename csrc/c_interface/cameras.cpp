@@ -1,5 +1,5 @@
-// Checks cameras with the words of Python (v3dg/cameras.py), and makes those of the
-// core.
+// Checks cameras, with the error texts of Python (v3dg/cameras.py), and converts them
+// to cameras of the core.
 
 #include "c_interface/cameras.h"
 
@@ -71,7 +71,7 @@ Intrinsics<double> lens_of(const v3dg_camera& camera, const Pinhole<double>& pro
     if (!is_distorted(camera)) return intrinsics_of(projection);
     const double* d = camera.distortion;
     if (camera.lens == V3DG_FISHEYE) return intrinsics_of_fisheye(projection, d);
-    // OpenCV's order is k1, k2, p1, p2, k3 to k6, that of the core k1 to k6, p1, p2.
+    // OpenCV's order is k1, k2, p1, p2, k3 to k6. The core's order is k1 to k6, p1, p2.
     const double terms[kNumOpenCvTerms] = {d[0], d[1], d[4], d[5], d[6], d[7], d[2], d[3]};
     return intrinsics_of_opencv(projection, terms);
 }
@@ -164,7 +164,8 @@ v3dg_camera camera_looking_at(const double eye[3], const double target[3], const
     for (double& value : rows[2]) value /= distance;
     double largest = 0;
     for (int k = 0; k < 3; ++k) largest = std::max(largest, std::fabs(up[k]));
-    double upwards[3];  // at most 1, so that squares neither overflow nor underflow
+    double upwards[3];  // divided by the largest element, so that squares neither
+                        // overflow nor underflow
     for (int k = 0; k < 3; ++k) upwards[k] = up[k] / (largest > 0 ? largest : 1);
     cross(rows[2], upwards, rows[0]);
     const double length = length_of(rows[0]);

@@ -1,5 +1,5 @@
-// Selects cuts, names the pages that they miss, and gathers their gaussians: the pages
-// of the cut are read and decoded in parallel, and transformed together.
+// Selects cuts, lists the pages that are missing, and gathers the gaussians of cuts.
+// Pages are read and decoded in parallel, and their gaussians are transformed together.
 
 #include "c_interface/cut.h"
 
@@ -24,7 +24,7 @@ namespace {
 constexpr double kMostFade = 1000;
 constexpr uint64_t kMostBudget = std::numeric_limits<int64_t>::max();
 
-// A cut with the memory of its arrays.
+// A cut that owns the memory of its arrays.
 struct OwnedCut : v3dg_cut {
     Buffer<v3dg_pair> pairs_memory;
     std::vector<v3dg_missing_page> missing_memory;
@@ -92,18 +92,18 @@ v3dg_pair pair_of(const v3dg_scene& scene, const SelectOutput& selected, size_t 
     return pair;
 }
 
-// Adds the absent pages of a bundle that a cut needs, with the absent pages above them,
-// which are at least as urgent.
+// Adds the absent pages of a bundle that a cut needs. Also adds the absent pages above
+// them, which are at least as urgent.
 void add_missing(const OpenBundle& bundle, uint32_t number, const std::vector<int64_t>& shift,
                  std::vector<uint32_t>& needs, std::vector<v3dg_missing_page>& missing) {
-    // Parents come later in the table.
+    // Groups come before their parents in the table.
     for (size_t page = 0; page + 1 < needs.size(); ++page) {
         float priority;
         std::memcpy(&priority, &needs[page], sizeof priority);
         if (shift[page] != kAbsentPage || !(priority >= kLeastPriority)) continue;
         missing.push_back({number, static_cast<uint32_t>(page), priority});
         const int32_t parent = bundle.parent_of_group(page);
-        // The bits of positive floats compare like the floats.
+        // Bits of positive floats have the same order as the floats.
         if (parent >= 0) needs[parent] = std::max(needs[parent], needs[page]);
     }
 }
@@ -121,10 +121,10 @@ std::vector<v3dg_missing_page> missing_pages(const v3dg_scene& scene, SceneTable
     return missing;
 }
 
-// The gaussians of those pages of a bundle that a cut uses.
+// The gaussians of the pages of one bundle that a cut uses.
 struct LoadedPages {
     std::vector<uint32_t> pages;     // ascending
-    std::vector<int64_t> first_row;  // of each page
+    std::vector<int64_t> first_row;  // first row of each page
     Buffer<unsigned char> memory;
     v3dg_gaussians rows{};
 
@@ -196,7 +196,7 @@ struct LoadedPages {
     }
 };
 
-// The instances of a cut, each once, and their columns.
+// The instances of a cut, each of them once, in columns.
 struct CutInstances {
     std::vector<int32_t> ids, bundle;
     std::vector<double> position, quaternion, scale;
@@ -217,7 +217,7 @@ struct CutInstances {
     }
 };
 
-// An array of the caller, or temporary memory if the caller passed none.
+// Returns an array of the caller, or temporary memory if the caller passed none.
 float* array_of(float* wanted, size_t size, Buffer<float>& own) {
     return wanted == nullptr ? own.reserve(size + 1) : wanted;
 }

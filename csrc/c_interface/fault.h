@@ -1,6 +1,6 @@
 #pragma once
 
-// The failures of the C library. Internally they are exceptions. v3dg.cpp converts them
+// The errors of the C library. Internally, they are exceptions, which v3dg.cpp converts
 // to status codes.
 
 #include <stdexcept>

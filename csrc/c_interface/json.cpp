@@ -1,5 +1,5 @@
 // Parses JSON into a tree of values, from the events of the library nlohmann/json. The
-// tree distinguishes whole numbers from others. Two errors are detected here, because
+// tree distinguishes integers from other numbers. Two errors are detected here, because
 // the library accepts them: keys that occur twice, and text after a zero byte.
 
 #include "c_interface/json.h"
@@ -69,8 +69,9 @@ class Builder final : public nlohmann::json_sax<nlohmann::json> {
         open_.pop_back();
         return true;
     }
-    // Returns where the next value belongs. A container that is open is the last value
-    // of the one around it, which does not grow meanwhile, so pointers stay valid.
+    // Returns the location of the next value. An open container is the last element of
+    // the container around it. That container does not grow while the inner one is
+    // open, so pointers stay valid.
     Json& place() {
         if (open_.empty()) return root_;
         if (auto* array = std::get_if<Json::Array>(&open_.back()->value))
@@ -105,7 +106,7 @@ std::string text_of_array(const Json::Array& items) {
 std::string text_of_object(const Json::Object& members) {
     std::string text;
     for (const auto& [key, value] : members)
-        text += (text.empty() ? "" : ", ") + quoted(key) + ": " + full_text(value);
+        text += (text.empty() ? "" : ", ") + in_quotes(key) + ": " + full_text(value);
     return "{" + text + "}";
 }
 
@@ -113,7 +114,7 @@ std::string full_text(const Json& json) {
     if (const bool* flag = json.get<bool>()) return *flag ? "true" : "false";
     if (const int64_t* number = json.get<int64_t>()) return std::to_string(*number);
     if (const double* number = json.get<double>()) return text_of(*number);
-    if (const std::string* text = json.get<std::string>()) return quoted(*text);
+    if (const std::string* text = json.get<std::string>()) return in_quotes(*text);
     if (const Json::Array* items = json.get<Json::Array>()) return text_of_array(*items);
     if (const Json::Object* members = json.get<Json::Object>()) return text_of_object(*members);
     return "null";
@@ -121,7 +122,7 @@ std::string full_text(const Json& json) {
 
 }  // namespace
 
-std::string quoted(const std::string& text) {
+std::string in_quotes(const std::string& text) {
     return nlohmann::json(text).dump(-1, ' ', true, nlohmann::json::error_handler_t::replace);
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 
-// JSON values, and the parser of strict JSON.
+// JSON values, and a parser of strict JSON.
 
 #include <cstdint>
 #include <string>
@@ -10,12 +10,12 @@
 
 namespace v3dg {
 
-// A JSON value. Whole numbers that an int64_t cannot hold are doubles.
+// A JSON value. Integers that do not fit into an int64_t are stored as doubles.
 class Json {
   public:
     struct Member;
     using Array = std::vector<Json>;
-    using Object = std::vector<Member>;  // in the order of the text
+    using Object = std::vector<Member>;  // in the order of the file
 
     std::variant<std::nullptr_t, bool, int64_t, double, std::string, Array, Object> value;
 
@@ -23,8 +23,8 @@ class Json {
     const T* get() const {
         return std::get_if<T>(&value);
     }
-    // Returns the member of an object with this key; null if there is none, or if the
-    // value is no object.
+    // Returns the member of an object with this key. Returns null if there is none, or
+    // if the value is not an object.
     const Json* find(std::string_view key) const;
 };
 
@@ -37,19 +37,19 @@ struct Json::Member {
 // for anything else, for keys that occur twice in an object, and for deep nesting.
 Json parse_json(std::string_view text);
 
-// Returns a value as short text for a message of one line. The overload for null says
-// that there is no value.
+// Returns a value as short text for a message of one line. For null, the text says that
+// there is no value.
 std::string json_text(const Json& value);
 std::string json_text(const Json* value);
 
-// Returns text of at most 60 characters; longer text ends in three dots.
+// Shortens text to at most 60 characters, the last three of which are then dots.
 std::string shortened(const std::string& text);
 
 // Returns a string in quotation marks, in ASCII with escape sequences.
-std::string quoted(const std::string& text);
+std::string in_quotes(const std::string& text);
 
-// Returns whether UTF-8 fits in one line of a message: it has no control characters and
-// no separators of lines.
+// Returns whether UTF-8 text fits in one line of a message. It must not have control
+// characters or line separators.
 bool is_one_line(std::string_view text);
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// The checks of values in a JSON file, with the messages of the Python reader.
+// Checks of values in a JSON file, with the error texts of the Python reader.
 
 #include "c_interface/json_node.h"
 
@@ -39,7 +39,7 @@ Node Node::field(const std::string& key) const {
     if (member == nullptr)
         throw problem("expected the field " + key + ", got an object without it");
     const bool is_plain = is_one_line(key) && key.size() <= kMostKeyCharacters;
-    const std::string name = is_plain ? key : shortened(quoted(key));
+    const std::string name = is_plain ? key : shortened(in_quotes(key));
     return {*member, *file_, path_.empty() ? name : path_ + "." + name};
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 
-// A JSON value that knows where it is in its file, for messages.
+// A JSON value together with its location in the file, for messages.
 
 #include <functional>
 #include <initializer_list>
@@ -18,8 +18,9 @@ namespace v3dg {
 class Node;
 using Fields = std::map<std::string, Node>;
 
-// A value, the name of its file, and its path in the document. It borrows the value and
-// the name. Functions throw Fault unless the value is what they return.
+// A value, the name of its file, and its path in the document. The value and the name
+// must outlive this object. A function throws Fault if the value is not of the kind
+// that it returns.
 class Node {
   public:
     Node(const Json& value, const std::string& file, std::string path)
@@ -30,8 +31,9 @@ class Node {
     // Return errors that begin with the location.
     Fault problem(const std::string& text, v3dg_status status = V3DG_ERROR_FILE) const;
     Fault error(const std::string& expected) const;
-    // Returns make(). Its failures of arguments, whose messages begin with the name of
-    // a field, become failures of the file, whose messages begin with the location.
+    // Returns make(). If it throws an error about an argument, whose message begins
+    // with the name of a field, throws an error about the file instead, whose message
+    // begins with the location of the value.
     template <class Make>
     auto attempt(const Make& make) const {
         try {
@@ -44,12 +46,13 @@ class Node {
 
     bool has(const std::string& key) const { return value_->find(key) != nullptr; }
     Node field(const std::string& key) const;
-    // Returns the fields of an object, and throws if one of `required` is missing. For
-    // only_fields(), fields other than `required` and `optional` are errors, too.
+    // Returns the fields of an object. Throws if one of `required` is missing.
+    // only_fields() also throws if there are fields other than `required` and
+    // `optional`.
     Fields fields(const std::vector<std::string>& required) const;
     Fields only_fields(const std::vector<std::string>& required,
                        const std::vector<std::string>& optional) const;
-    // Calls use(node) for every value of an array.
+    // Calls use(node) for each value of an array.
     void for_each(const std::function<void(const Node&)>& use) const;
 
     std::string text() const;
@@ -58,10 +61,11 @@ class Node {
                   double lower_bound = -std::numeric_limits<double>::infinity(),
                   double upper_bound = std::numeric_limits<double>::infinity()) const;
     double positive() const { return number("a positive number", 0); }
-    // Returns the side of a picture in px.
+    // Returns the width or height of a picture in px.
     int size() const;
     std::vector<double> numbers() const;
-    // Return `length` numbers, and the rows of a matrix one after another.
+    // vector() returns `length` numbers; the other function returns the rows of a
+    // matrix one after another.
     std::vector<double> vector(size_t length) const;
     std::vector<double> matrix(size_t num_rows, size_t num_columns) const;
 

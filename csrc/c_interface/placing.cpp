@@ -1,6 +1,6 @@
-// The arithmetic of poses, in the order of operations of the Python module where the
-// result is the same to the last bit (quaternions), and of other algorithms with the
-// same result up to rounding elsewhere (similarity transforms).
+// The arithmetic of poses. Quaternions are computed with the operations of the Python
+// module in the same order, so the results are equal to the last bit. Similarity
+// transforms use other algorithms, whose results are equal up to rounding.
 
 #include "c_interface/placing.h"
 
@@ -18,7 +18,7 @@ namespace {
 
 const double kHalf = std::sqrt(0.5);
 
-// The largest relative deviation of a matrix from a similarity.
+// The largest relative difference between a matrix and a similarity transform.
 constexpr double kSimilar = 1e-4;
 
 // Rotations of each axis to -y.
@@ -50,7 +50,7 @@ Matrix3 rotation_of(const double quaternion[4]) {
 }
 
 // Returns the nearest rotation by Newton's iteration. Precondition: the matrix is a
-// similarity up to kSimilar, with a scale near 1.
+// similarity transform up to kSimilar, with a scale near 1.
 Matrix3 nearest_rotation(Matrix3 matrix) {
     for (int step = 0; step < 8; ++step) {
         const double inverse = 1 / matrix.determinant();
@@ -63,8 +63,8 @@ Matrix3 nearest_rotation(Matrix3 matrix) {
     return matrix;
 }
 
-// Returns the quaternion with w >= 0 of a rotation. It divides by the largest of the
-// four components, so that nothing cancels.
+// Returns the quaternion of a rotation, with w >= 0. It divides by the largest of the
+// four components, so that there is no cancellation.
 Quaternion quaternion_of(const Matrix3& rotation) {
     const auto& m = rotation.m;
     const double squares[4] = {1 + m[0][0] + m[1][1] + m[2][2], 1 + m[0][0] - m[1][1] - m[2][2],
@@ -112,8 +112,8 @@ double dot_of_columns(const Matrix3& a, int i, int j) {
     return a.m[0][i] * a.m[0][j] + a.m[1][i] * a.m[1][j] + a.m[2][i] * a.m[2][j];
 }
 
-// Throws unless the linear part, whose largest element was divided by `largest`, is a
-// rotation and a uniform scale.
+// Throws unless the linear part is a rotation and a uniform scale. Its largest element
+// was divided by `largest`.
 void check_similarity(const Matrix3& linear, double largest) {
     double scales[3];
     for (int j = 0; j < 3; ++j) scales[j] = std::sqrt(dot_of_columns(linear, j, j));

@@ -14,25 +14,26 @@ using Quaternion = std::array<double, 4>;  // w, x, y, z
 constexpr int32_t kSharedEnvironment = -1;
 constexpr int32_t kMostEnvironment = (1 << 24) - 1;
 
-// Returns the names of axes as Python shows them: 'x' or 'y' ...
+// Returns the names of all axes for messages: 'x' or 'y' ...
 std::string names_of_axes();
 bool is_axis(const std::string& name);
 
-// Returns a quaternion of length one. Precondition: it is finite and not zero.
+// Returns a quaternion of length 1. Precondition: `quaternion` is finite and not zero.
 Quaternion normalised(const Quaternion& quaternion);
 
-// Returns the rotation by `second`, then by `first`.
+// Returns the rotation that applies `second` first, and then `first`.
 Quaternion product(const Quaternion& first, const Quaternion& second);
 
-// Returns the rotation from one axis to another, about x if both are y or z.
+// Returns the rotation from one axis to another. If both are y or z, it is a rotation
+// about x.
 Quaternion turn_between(const std::string& up, const std::string& target);
 
-// Returns an instance with a quaternion of length one. Throws Fault for a value that
-// v3dg_instance does not allow; `name` is the name of the instance in messages.
+// Returns an instance with a quaternion of length 1. Throws Fault for a value that
+// v3dg_instance does not allow. `name` is the name of the instance in messages.
 v3dg_instance checked_instance(const v3dg_instance& instance, const std::string& name);
 
-// Returns `inner` after placing its whole scene like `outer`. The bundle is that of
-// `inner`. Throws Fault if the result is not allowed.
+// Returns `inner`, with the pose that results from placing its scene like `outer`. The
+// bundle is that of `inner`. Throws Fault if the result is not allowed.
 v3dg_instance composed(const v3dg_instance& outer, const v3dg_instance& inner,
                        const std::string& name);
 

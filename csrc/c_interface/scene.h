@@ -19,15 +19,15 @@ struct NamedCamera {
     v3dg_camera camera;
 };
 
-// The content of a scene's file. All values are checked; quaternions have length one.
+// The content of a scene's file. All values are checked, and quaternions have length 1.
 struct SceneContent {
     std::vector<SharedBundle> bundles;  // in the order of their first instances
     std::vector<v3dg_instance> instances;
     std::vector<NamedCamera> cameras;
-    std::string up;  // the axis that is up, or empty
+    std::string up;  // the axis that points up, or empty
 };
 
-// The instances of a scene as the core reads them.
+// The instances of a scene in the form that the core reads.
 class InstanceColumns {
   public:
     InstanceColumns() = default;
@@ -46,8 +46,8 @@ class InstanceColumns {
 struct v3dg_scene {
     v3dg::SceneContent content;
     v3dg::InstanceColumns columns;
-    // For each bundle: 0 for resident pages, v3dg::kAbsentPage for others; empty if all
-    // are resident.
+    // For each bundle, 0 for resident pages and v3dg::kAbsentPage for others. It is
+    // empty if all pages are resident.
     std::vector<std::vector<int64_t>> page_shift;
-    uint64_t revision = 0;  // of the instances; no other scene has the same
+    uint64_t revision = 0;  // identifies the instances; different for every scene
 };

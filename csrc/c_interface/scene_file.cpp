@@ -1,6 +1,6 @@
-// Reads scenes with the checks and the words of the Python reader (v3dg/scene/file.py).
-// Each file is read once. The layouts that were published with the V3DG paper are not
-// read.
+// Reads scenes with the checks and the error texts of the Python reader
+// (v3dg/scene/file.py). Each file is read once. The layouts that were published with
+// the V3DG paper are not supported.
 
 #include "c_interface/scene_file.h"
 
@@ -112,7 +112,7 @@ void read_pose(const Node& node, const Fields& fields, v3dg_instance& out) {
     if (const Node* scale = field("scale")) out.scale = scale->positive();
 }
 
-// Returns a number that a float32 holds as positive, or throws.
+// Returns a number that is positive as a float32, or throws.
 float positive_float(const Node& node) {
     const double number = node.positive();
     const auto rounded = static_cast<float>(number);
@@ -121,7 +121,7 @@ float positive_float(const Node& node) {
     return rounded;
 }
 
-// Returns a whole number in a range, or throws.
+// Returns an integer in a range, or throws.
 int32_t whole_number(const Node& node, int32_t low, int32_t high) {
     const double number = node.number();
     if (number != std::trunc(number) || number < low || number > high)
@@ -151,7 +151,7 @@ void read_factors(const Fields& fields, v3dg_instance& out) {
     }
     if (const Node* environment = field("environment"))
         out.environment = whole_number(*environment, kSharedEnvironment, kMostEnvironment);
-    // Labels are only checked: cuts have no use for them.
+    // Labels are only checked, because cuts do not use them.
     if (const Node* label = field("label")) whole_number(*label, -1, INT32_MAX);
 }
 
@@ -384,8 +384,8 @@ class SceneFiles {
         return scene.up.empty() ? "z" : scene.up;
     }
 
-    // Rotates the subject from its up axis to that of the instance, which becomes the
-    // scene's.
+    // Rotates the subject from its own up axis to the up axis of the instance. The
+    // latter becomes the up axis of the scene.
     static void stand_upright(const Node& node, const Node& up, const std::string& own,
                               SceneContent& scene, v3dg_instance& instance) {
         const std::string axis = axis_of(node, up);

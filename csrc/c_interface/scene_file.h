@@ -1,6 +1,6 @@
 #pragma once
 
-// Reads the files of scenes (docs/scene.md).
+// Reads scene files (docs/scene.md).
 
 #include <string>
 
@@ -8,10 +8,10 @@
 
 namespace v3dg {
 
-// Returns whether a file has the name of a scene.
+// Returns whether a file name is that of a scene.
 bool is_scene_name(const std::string& path);
 
-// Reads a scene with all files to which it refers. Throws Fault, whose message names
+// Reads a scene, with all files to which it refers. Throws Fault, whose message names
 // the file and the place in it.
 SceneContent read_scene_file(const std::string& path);
 

@@ -22,10 +22,11 @@ namespace {
 
 constexpr size_t kMostMessageBytes = 2000;
 
-// The message of the last failure. It has a fixed size, so that setting it cannot fail.
+// The message of the last error. It has a fixed size, so that setting it cannot fail.
 thread_local char last_error[kMostMessageBytes + 1] = "";
 
-// Sets the message; control characters, which names of files may have, become "?".
+// Sets the message. Control characters, which file names may contain, are replaced by
+// "?".
 v3dg_status fail(v3dg_status status, const char* text) noexcept {
     size_t size = 0;
     for (; text[size] != '\0' && size < kMostMessageBytes; ++size) {
@@ -83,7 +84,7 @@ uint64_t new_revision() {
     return ++last;
 }
 
-// Replaces the instances, which are checked.
+// Checks the instances, and replaces those of the scene.
 void publish(v3dg_scene& scene, std::vector<v3dg_instance> instances) {
     InstanceColumns columns(instances);
     scene.content.instances = std::move(instances);
@@ -99,7 +100,7 @@ SceneContent read_content(const std::string& path) {
     return content;
 }
 
-// Checks that all pages above each resident one are resident, too.
+// Checks that all pages above each resident page are resident.
 std::vector<int64_t> shifts_of(const OpenBundle& bundle, const uint8_t* is_resident,
                                uint32_t num_pages) {
     check_argument(num_pages == bundle.num_pages(), "num_pages",

@@ -91,12 +91,13 @@
 
 namespace v3dg {
 
-// The models that a camera may have.
+// The models that a camera can have.
 enum class LensModel { pinhole, opencv, fisheye };
 
-// A camera of any model: the fields of a pinhole, and the parameters of its lens, which
-// only the model reads. Its members call those of the model. Loops over gaussians use
-// visit() outside of the loop, so that pinholes do not pay for the choice.
+// A camera of any model. It has the fields of a pinhole camera, and the parameters of
+// its lens, which only the model reads. Its members call those of the model. Loops over
+// gaussians call visit() outside the loop, so that pinhole cameras do not pay for the
+// choice.
 template <class T>
 struct Intrinsics : Pinhole<T> {
     using Limits = SlopeLimits<T>;
@@ -104,7 +105,7 @@ struct Intrinsics : Pinhole<T> {
     using Point = ImagePoint<V>;
     static constexpr int kNumLensValues = 10;
 
-    // LensModel, in a type as large as T, so that there is no padding.
+    // The LensModel, in a type as large as T, so that there is no padding.
     std::conditional_t<sizeof(T) == sizeof(int64_t), int64_t, int32_t> lens;
     T lens_values[kNumLensValues];
 
@@ -119,7 +120,7 @@ struct Intrinsics : Pinhole<T> {
         const T* v = lens_values;
         return {{pinhole()}, {v[0], v[1], v[2], v[3]}, v[4], v[5], v[6], v[7], v[8]};
     }
-    // Returns body(model).
+    // Calls body(model) and returns its result.
     template <class Body>
     V3DG_HD V3DG_INLINE auto visit(const Body& body) const {
         switch (model()) {
@@ -210,8 +211,8 @@ struct Intrinsics : Pinhole<T> {
     }
 };
 
-// Return the projection of each model; `values` are coefficients in the order of the
-// model's fields. The ranges of the model are computed here.
+// Return the projection of each model. `values` has the coefficients in the order of
+// the model's fields. These functions also compute the valid ranges of the model.
 template <class T>
 V3DG_HD Intrinsics<T> intrinsics_of(const Pinhole<T>& projection) {
     return {projection, 0, {}};
@@ -240,11 +241,11 @@ inline Intrinsics<double> intrinsics_of_fisheye(const Pinhole<double>& projectio
     return out;
 }
 
-// A camera in the world, in double precision: its pose, its camera model, and the
-// requested part of its image.
+// A camera in the world, in double precision: its pose, its camera model, and the part
+// of its image that is drawn.
 struct Camera : CameraPose, Intrinsics<double>, ImagePart {
-    // px2_per_steradian() of the camera model, which selection needs for each instance.
-    // Not used for pinholes.
+    // The result of px2_per_steradian(), stored because selection needs it for each
+    // instance. Not used for pinhole cameras.
     double density;
 
     // Returns the camera model with scalar type T.
@@ -255,7 +256,8 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
     V3DG_HD double px2_per_steradian() const {
         return is_pinhole() ? pinhole().px2_per_steradian() : density;
     }
-    // Sets the camera model; the pose and the requested part stay.
+    // Sets the camera model. The pose and the part of the image that is drawn stay the
+    // same.
     void set_lens(const Intrinsics<double>& projection) {
         static_cast<Intrinsics<double>&>(*this) = projection;
         density = projection.px2_per_steradian();
@@ -271,7 +273,8 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
         camera.density *= factor * factor;
         return camera;
     }
-    // Returns a camera whose image is the given rectangle of this camera's image, px.
+    // Returns a camera whose image is a rectangle of this camera's image. The rectangle
+    // is given in px.
     V3DG_HD Camera cropped(double left, double top, double new_width, double new_height) const {
         Camera camera = *this;
         camera.crop(left, top, new_width, new_height);
@@ -285,30 +288,30 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
 static_assert(sizeof(Camera) == 38 * sizeof(double),
               "operator== compares all bytes, so Camera must have no padding");
 
-// Returns a camera with the given projection, whose whole image is requested. The
-// caller sets the pose.
+// Returns a camera with the given projection, which draws its whole image. The caller
+// must set the pose.
 inline Camera with_projection(const Intrinsics<double>& projection) {
     return {CameraPose{}, projection, ImagePart{0, 0, projection.width, projection.height},
             projection.px2_per_steradian()};
 }
 
-// The viewpoint for which a cut is selected: one camera, or the two eyes of a stereo
-// camera. The rotations of the two eyes are equal.
+// The viewpoint for which a cut is selected. It is one camera, or the two eyes of a
+// stereo camera, which have the same rotation.
 struct Eyes {
-    Camera camera[2];  // equal to each other if there is one eye
+    Camera camera[2];  // if there is one eye, both elements are equal
     bool are_two;
 
     Eyes() : Eyes(Camera{}) {}
     V3DG_HD Eyes(const Camera& only) : camera{only, only}, are_two(false) {}
     V3DG_HD Eyes(const Camera& left, const Camera& right) : camera{left, right}, are_two(true) {}
     V3DG_HD int count() const { return are_two ? 2 : 1; }
-    // Compares bits, so NaN equals itself and -0 differs from 0.
+    // Compares bits, so that NaN equals itself, and -0 differs from 0.
     bool operator==(const Eyes& other) const {
         return are_two == other.are_two && std::memcmp(camera, other.camera, sizeof camera) == 0;
     }
 };
 
-// The part of CameraModel that projection uses.
+// The members of CameraModel that projection uses.
 template <class C>
 concept ProjectingModel =
     std::is_trivially_copyable_v<C> &&
@@ -339,7 +342,7 @@ concept ProjectingModel =
         } -> std::same_as<SphereImage<typename C::Scalar>>;
     };
 
-// The part of CameraModel that selection uses.
+// The members of CameraModel that selection uses.
 template <class C>
 concept SelectingModel =
     requires(const C& camera, const Camera* eyes, const typename C::Sides& sides,

@@ -10,15 +10,15 @@
 
 namespace v3dg {
 
-// The largest deviation of a rotation's rows from orthonormal rows. Matrices that were
-// stored as float32 deviate a little.
+// How much the rows of a rotation may differ from orthonormal rows. Matrices that were
+// stored as float32 differ a little.
 constexpr double kRotationTolerance = 1e-4;
 
 // The reason why numbers are not a valid camera.
 enum class CameraFault : int32_t { none, not_finite, no_rotation, last_row, focal_length, skew };
 
-// Returns whether a 3x3 matrix, whose rows are `stride` apart, is a rotation. Returns
-// false if a number is NaN.
+// Returns whether a 3x3 matrix is a rotation. Its rows are `stride` apart. If any
+// number is NaN, returns false.
 V3DG_HD inline bool is_rotation(const double* m, int stride) {
     const double *x = m, *y = m + stride, *z = m + 2 * stride;
     const auto dot = [](const double* a, const double* b) {
@@ -35,8 +35,8 @@ V3DG_HD inline bool is_rotation(const double* m, int stride) {
     return is_orthonormal && determinant > 0;
 }
 
-// Returns the fault of a (4, 4) world-to-camera matrix or of a (3, 3) matrix of
-// intrinsics in px.
+// Returns what is wrong with a (4, 4) world-to-camera matrix, or with a (3, 3) matrix
+// of intrinsics in px.
 V3DG_HD inline CameraFault fault_of_camera(const double viewmat[16], const double K[9]) {
     bool is_finite = true;
     for (int k = 0; k < 16; ++k) is_finite = is_finite && fabs(viewmat[k]) <= DBL_MAX;
@@ -50,7 +50,7 @@ V3DG_HD inline CameraFault fault_of_camera(const double viewmat[16], const doubl
     return is_plain ? CameraFault::none : CameraFault::skew;
 }
 
-// Returns the camera with this pose and these intrinsics. Its whole image is requested.
+// Returns the camera with this pose and these intrinsics. It draws its whole image.
 V3DG_HD inline Camera camera_of(const double viewmat[16], const double K[9], int width, int height,
                                 double near_depth) {
     Camera camera{};

@@ -1,26 +1,29 @@
 #pragma once
 
-// OpenCV's fisheye lens, which COLMAP calls OPENCV_FISHEYE. A point at the angle theta
-// from the camera's axis has its image at the radius
+// OpenCV's fisheye lens, which COLMAP calls OPENCV_FISHEYE. The image of a point at the
+// angle theta from the camera's axis is in the direction of the point's x and y, at the
+// radius
 //   rho(theta) = theta (1 + k1 theta² + k2 theta⁴ + k3 theta⁶ + k4 theta⁸)
-// in units of the focal lengths, in the direction of its x and y. Angles may exceed 90
-// degrees. Source: OpenCV's documentation of its fisheye model.
+// in units of the focal lengths. Angles may exceed 90 degrees. Source: OpenCV's
+// documentation of its fisheye model.
 //
 // With h² = x² + y² and n² = h² + z², the image is (x g, y g) with g = rho / h. Its
-// Jacobian is [g + x² e, x y e, x gz; x y e, g + y² e, y gz], where e is twice the
-// derivative of g by h², and gz that by z. The depth of a point is n, its distance from
-// the eye.
+// Jacobian is [g + x² e, x y e, x gz; x y e, g + y² e, y gz]. Here, e is twice the
+// derivative of g with respect to h², and gz is the derivative with respect to z. The
+// depth of a point is n, its distance from the eye.
 //
-// The valid range ends where rho stops to increase, or near 180 degrees, where a point
-// would become a circle. Points outside are not drawn. The Jacobian is that at the
-// angle, which is clamped kFovMargin outside of the image, as for a pinhole.
+// The valid range ends where rho stops increasing, or near 180 degrees, where a point
+// would become a circle. Points outside this range are not drawn. As for a pinhole
+// camera, the Jacobian is computed at an angle that is clamped to kFovMargin outside
+// the image.
 
 #include "camera/distorted.h"
 #include "math/solid_angle.h"
 
 namespace v3dg {
 
-// rho at one angle, and its first two derivatives; `curvature` is divided by the angle.
+// rho at one angle, and its first two derivatives. `curvature` is the second one,
+// divided by the angle.
 template <class V>
 struct FisheyeRadius {
     V value, slope, curvature;
@@ -35,8 +38,8 @@ struct FisheyeFactor {
 template <class T>
 struct Fisheye : Distorted<T> {
     T k[4];
-    T clamp_angle, clamp_sin, clamp_cos;  // the angle at which the Jacobian is clamped
-    T valid_angle, valid_cos;             // the end of the valid range
+    T clamp_angle, clamp_sin, clamp_cos;  // angle at which the Jacobian is clamped
+    T valid_angle, valid_cos;             // end of the valid range
 
     template <class U>
     V3DG_HD Fisheye<U> rounded_to() const {
@@ -101,7 +104,7 @@ struct Fisheye : Distorted<T> {
         d_p[2] += d_g * f.gz + depth_slope * p[2];
     }
 
-    // The largest density of pixels over the directions in the image.
+    // The largest density of pixels over all directions in the image.
     V3DG_HD T px2_per_steradian() const {
         const double most = first_reaching(radius_of_image(*this), double(valid_angle),
                                            [&](double angle) { return radius_at(angle).value; });
@@ -112,7 +115,8 @@ struct Fisheye : Distorted<T> {
 
     // See camera/distorted.h.
     V3DG_HD FrustumSides sides_of_part(const ImagePart& part, double pad_px) const {
-        constexpr double kMostAngle = 1.5;  // of a cone that planes enclose
+        constexpr double kMostAngle = 1.5;  // largest half angle of a cone that planes
+                                            // enclose
         const auto low = [&](double angle) { return radius_at(angle).value; };
         const double radius = radius_of_window(*this, part, pad_px);
         const double last = double(valid_angle);
@@ -132,16 +136,17 @@ struct Fisheye : Distorted<T> {
         return sides_of_cone(slope, guard);
     }
 
-    // Nothing is nearer than the near distance on one side of a plane: culls nothing.
+    // With a near distance instead of a near plane, no plane bounds what is too near.
+    // So this offset culls nothing.
     V3DG_HD double front_offset(const InstanceAxes&, double) const { return -1e30; }
 
-    // Such cameras have one eye.
+    // Stereo cameras cannot have lenses, so there is one eye.
     template <class Eye>
     static V3DG_HD FrustumSides sides_of(const Eye eyes[2], int, double pad_px) {
         return eyes[0].fisheye().sides_of_part(eyes[0], pad_px);
     }
 
-    // Sets the ranges; the other fields are set.
+    // Computes the ranges. All other fields must be set.
     void set_ranges() {
         constexpr double kMostAngle = 0.95 * kPi;
         const double end =
@@ -168,19 +173,19 @@ struct Fisheye : Distorted<T> {
     V3DG_HD FisheyeRadius<double> radius_at(double angle) const {
         return rounded_to<double>().radius(angle);
     }
-    // The change of the image per radian across the radius.
+    // The change of the image per radian, across the radius.
     V3DG_HD double across_at(double angle) const {
         return angle > 1e-6 ? radius_at(angle).value / sin(angle) : 1.0;
     }
 
-    // Whether h is so small that series are used.
+    // Returns whether h is so small that the series must be used.
     template <class V>
     static V3DG_HD V3DG_INLINE auto is_near_axis(const V& h, const V& n) {
         return h < n * T(0.01);
     }
 
-    // Returns g for a radius rho at an angle. Near the axis angle / h = (1 + h² / (6
-    // n²)) / n.
+    // Returns g for a radius rho at an angle. Close to the axis, angle / h = (1 + h² /
+    // (6 n²)) / n.
     template <class V>
     V3DG_HD V3DG_INLINE V factor_of(const V& rho, const V& angle, const V& h, const V& n) const {
         const V sine = h / n, t = angle * angle;
@@ -203,7 +208,8 @@ struct Fisheye : Distorted<T> {
         return out;
     }
 
-    // Moves a point to the clamped angle, at the same distance, if its angle is larger.
+    // If the angle of a point exceeds the clamped angle, moves the point to that angle,
+    // at the same distance.
     template <class V>
     V3DG_HD V3DG_INLINE void clamp(const V p[3], const V& angle, const V& h, const V& n,
                                    V c[3]) const {
@@ -237,7 +243,8 @@ struct Fisheye : Distorted<T> {
         const V h = sqrt_of(h2), n = sqrt_of(n2);
         const FisheyeRadius<V> rho = radius(angle);
         const FisheyeFactor<V> f = factors(c, angle);
-        // The second derivative of rho over h. Near the axis angle / h is 1 / n.
+        // The second derivative of rho, divided by h. Close to the axis, angle / h is 1
+        // / n.
         const auto is_near = is_near_axis(h, n);
         const V angle_h = is_near ? 1 / n : angle / max_of(h, all_lanes<V>(kTiny));
         const V bend = rho.curvature * angle_h;
@@ -246,7 +253,8 @@ struct Fisheye : Distorted<T> {
         const V e_z = (2 * rho.slope - bend * z) * inv_n4;
         const V far_e = ((T(0.5) * bend * z - rho.slope) * z * inv_n4 - T(1.5) * f.e) /
                         max_of(h2, all_lanes<V>(kTiny));
-        const V e_h2 = is_near ? V{} : far_e;  // by h²; its products vanish near the axis
+        const V e_h2 = is_near ? V{} : far_e;  // derivative with respect to h²; its
+                                               // products vanish close to the axis
         const V x1 = this->fx * d_j1[0], y1 = this->fx * d_j1[1], z1 = this->fx * d_j1[2];
         const V x2 = this->fy * d_j2[0], y2 = this->fy * d_j2[1], z2 = this->fy * d_j2[2];
         const V d_g = x1 + y2;

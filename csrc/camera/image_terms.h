@@ -5,7 +5,7 @@
 
 namespace v3dg {
 
-// The requested part of an image, px: x in [x0, x1) and y in [y0, y1).
+// The part of the image that is drawn, px: x in [x0, x1) and y in [y0, y1).
 struct ImagePart {
     double x0, y0, x1, y1;
 };
@@ -14,9 +14,10 @@ struct ImagePart {
 // positive.
 struct Plane {
     float normal[3], offset;
-    // The linearised image of a gaussian may extend beyond the true projection of its
-    // box. `guard` bounds by how much, per unit of the box's half extent along the
-    // guard direction of the model, which for a pinhole is its depth.
+    // A margin. The linearised image of a gaussian may extend beyond the true
+    // projection of its box. `guard` bounds by how much, relative to the box's half
+    // extent along the guard direction of the model. For a pinhole camera, this
+    // direction is the depth.
     float guard;
 };
 
@@ -29,7 +30,7 @@ struct SphereImage {
 
 // The projection of a gaussian: the pixel (u, v) and the depth of its mean, and the
 // rows a1 and a2 of the Jacobian times the gaussian's axes in view space. The same
-// struct holds the gradients of these values.
+// struct also holds the gradients of these values.
 template <class V>
 struct LinearImage {
     V u, v, depth;

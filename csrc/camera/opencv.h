@@ -1,28 +1,29 @@
 #pragma once
 
-// A pinhole with OpenCV's radial and tangential distortion, which COLMAP calls
-// FULL_OPENCV. Its simpler models, down to SIMPLE_RADIAL, have zeros in place of the
-// other coefficients. A point at the slopes x = X / Z, y = Y / Z, with r² = x² + y² and
-//   R = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶),
-// has its image at (fx x' + cx, fy y' + cy) with
+// A pinhole camera with OpenCV's radial and tangential distortion, which COLMAP calls
+// FULL_OPENCV. Simpler models, down to SIMPLE_RADIAL, set the other coefficients to
+// zero. Let a point have the slopes x = X / Z and y = Y / Z, with r² = x² + y² and
+//   R = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶).
+// Its image is at (fx x' + cx, fy y' + cy) with
 //   x' = x R + 2 p1 x y + p2 (r² + 2 x²),  y' = y R + p1 (r² + 2 y²) + 2 p2 x y.
 // Source: OpenCV's documentation of camera calibration.
 //
-// Let q = (p2, p1), s = (x, y), and R' the derivative of R by r². The map is (x', y') =
-// s R + 2 (q . s) s + |s|² q, and its derivative by s is the symmetric matrix
+// Let q = (p2, p1) and s = (x, y), and let R' be the derivative of R with respect to
+// r². The map is (x', y') = s R + 2 (q . s) s + |s|² q. Its derivative with respect to
+// s is the symmetric matrix
 //   D = R I + 2 R' s sᵀ + 2 (q . s) I + 2 (q sᵀ + s qᵀ).
 // The last two terms change D by at most 6 |q| r, so its eigenvalues are at least
-// min(R, R + 2 r² R') - 6 |q| r. Where that is positive in a disc, the map is one to
+// min(R, R + 2 r² R') - 6 |q| r. In a disc in which this is positive, the map is one to
 // one, and the radius of an image is at least low(r) = r R - 3 |q| r², which increases.
-// That disc is the valid range; points outside, beyond the first fold, are not drawn.
-// The Jacobian is that at the slopes, moved towards the axis where they are farther
-// than kFovMargin outside of the image, as for a pinhole.
+// That disc is the valid range. Points outside it, beyond the first fold, are not
+// drawn. As for a pinhole camera, the slopes at which the Jacobian is computed are
+// clamped: those farther than kFovMargin outside the image are moved towards the axis.
 
 #include "camera/distorted.h"
 
 namespace v3dg {
 
-// The values of R at one r², and its derivatives by r².
+// The value of R at one r², and its derivatives with respect to r².
 template <class V>
 struct RadialFactor {
     V value, slope, curvature;
@@ -31,8 +32,8 @@ struct RadialFactor {
 template <class T>
 struct OpenCv : Distorted<T> {
     T k[6], p1, p2;
-    T clamp_slope;  // slopes are clamped to this radius in the Jacobian
-    T valid_slope;  // the end of the valid range
+    T clamp_slope;  // radius to which slopes are clamped in the Jacobian
+    T valid_slope;  // end of the valid range
 
     template <class U>
     V3DG_HD OpenCv<U> rounded_to() const {
@@ -78,7 +79,8 @@ struct OpenCv : Distorted<T> {
         const V shrink = shrink_of(r2);
         V d_x, d_y;
         jacobian_vjp(inv_z, shrink * x, shrink * y, d_j1, d_j2, d_x, d_y);
-        // Clamped slopes move only around the axis, so their length has no gradient.
+        // Clamped slopes only change their direction around the axis, so their length
+        // has no gradient.
         const V along = r2 > all_lanes<V>(clamp_slope * clamp_slope)
                             ? (x * d_x + y * d_y) / max_of(r2, all_lanes<V>(kTiny))
                             : V{};
@@ -94,9 +96,9 @@ struct OpenCv : Distorted<T> {
         d_p[2] = d.depth - inv_z * (dot3(at.j1, d_j1) + dot3(at.j2, d_j2) + x * d_x + y * d_y);
     }
 
-    // The density at the axis of a pinhole, times a bound on the determinant of D in
-    // the image. As for a pinhole, the growth of the density away from the axis that
-    // comes from the slopes alone is ignored.
+    // The density at the axis of a pinhole camera, times a bound on the determinant of
+    // D in the image. The density also grows away from the axis because of the slopes
+    // alone; as for a pinhole camera, this growth is ignored.
     V3DG_HD T px2_per_steradian() const {
         const double most = first_reaching(radius_of_image(*this), double(valid_slope),
                                            [&](double r) { return lowest_radius(r); });
@@ -107,9 +109,9 @@ struct OpenCv : Distorted<T> {
         return T(double(this->fx) * double(this->fy) * area);
     }
 
-    // See camera/distorted.h. With slopes in place of angles, (1) is |D| sqrt(1 + c²)
-    // |d| / Z >= low(r) - R for the clamped radius c, and a normal N = (±1, 0, -slope)
-    // has N . p <= Z (r - slope).
+    // See camera/distorted.h. Here, slopes replace angles. The condition (1) becomes
+    // |D| sqrt(1 + c²) |d| / Z >= low(r) - R for the clamped radius c, and a normal N =
+    // (±1, 0, -slope) has N . p <= Z (r - slope).
     V3DG_HD FrustumSides sides_of_part(const ImagePart& part, double pad_px) const {
         const auto low = [&](double r) { return lowest_radius(r); };
         const double radius = radius_of_window(*this, part, pad_px);
@@ -129,13 +131,13 @@ struct OpenCv : Distorted<T> {
         return sides_of_cone(slope, guard);
     }
 
-    // Such cameras have one eye.
+    // Stereo cameras cannot have lenses, so there is one eye.
     template <class Eye>
     static V3DG_HD FrustumSides sides_of(const Eye eyes[2], int, double pad_px) {
         return eyes[0].opencv().sides_of_part(eyes[0], pad_px);
     }
 
-    // Sets the ranges; the other fields are set.
+    // Computes the ranges. All other fields must be set.
     void set_ranges() {
         constexpr double kMostAngle = 1.5608;  // atan(100)
         const double end = end_of_range(kMostAngle, [&](double angle) {
@@ -150,7 +152,7 @@ struct OpenCv : Distorted<T> {
   private:
     static constexpr T kTiny = T(1e-30);
 
-    // Bounds on the eigenvalues of D at a radius: of those of the radial part along and
+    // Bounds on the eigenvalues of D at a radius: those of the radial part along and
     // across the radius, and the smallest one.
     struct Stretch {
         double along, across, least;
@@ -192,7 +194,7 @@ struct OpenCv : Distorted<T> {
         return r * lens.radial(r * r).value - tangential;
     }
 
-    // Returns the factor of slopes in the Jacobian.
+    // Returns the factor that slopes are multiplied by in the Jacobian.
     template <class V>
     V3DG_HD V3DG_INLINE V shrink_of(const V& r2) const {
         const V limit = all_lanes<V>(clamp_slope);

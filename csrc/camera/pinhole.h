@@ -1,11 +1,11 @@
 #pragma once
 
-// The pinhole camera model. The point (x, y, z) in view space has depth z and is drawn
-// at pixel (fx x / z + cx, fy y / z + cy). camera/camera.h documents the members.
+// The pinhole camera model. A point (x, y, z) in view space has the depth z, and is
+// drawn at pixel (fx x / z + cx, fy y / z + cy). camera/camera.h explains the members.
 //
 // The Jacobian of the projection is
 //   J = [fx / z, 0, -fx / z sx; 0, fy / z, -fy / z sy]   with sx = x / z, sy = y / z.
-// Outside of the image, the slopes sx and sy in J are clamped, because the linearised
+// Outside the image, the slopes sx and sy in J are clamped, because the linearised
 // image of a gaussian would become far too large (as in 3D Gaussian Splatting).
 
 #include <cmath>
@@ -36,12 +36,12 @@ struct PinholePoint {
 };
 
 // The side planes of a frustum in camera coordinates: right, left, bottom, top. A point
-// is outside of a plane if sign * x > slope * z, or sign * y for bottom and top. With
-// two eyes, each plane has the larger of the two eyes' slopes, so that a point outside
-// of the plane for both eyes is outside of both frusta.
+// is outside a plane if sign * x > slope * z, or if sign * y > slope * z for bottom and
+// top. With two eyes, each plane has the larger slope of the two, so that a point
+// outside the plane for both eyes is outside both frusta.
 struct FrustumSides {
     double slope[4];
-    float guard[4];  // see Plane::guard
+    float guard[4];  // explained at Plane::guard
 };
 
 // A pinhole camera, in px. The centre of pixel (i, j) is at (i + ½, j + ½).
@@ -131,7 +131,7 @@ struct Pinhole {
             d_m[3 + k] = fy_z * d.a2[k];
             d_m[6 + k] = -at.slope_x * d_m[k] - at.slope_y * d_m[3 + k];
         }
-        // Where a slope is clamped, the Jacobian is constant in that slope.
+        // If a slope is clamped, the Jacobian is constant in that slope.
         const V true_x = p[0] * at.inv_z, true_y = p[1] * at.inv_z;
         V d_slope_x = -(d_m[0] * m[6] + d_m[1] * m[7] + d_m[2] * m[8]);
         V d_slope_y = -(d_m[3] * m[6] + d_m[4] * m[7] + d_m[5] * m[8]);
@@ -158,8 +158,8 @@ struct Pinhole {
     }
 
     // Returns the density at the optical axis. The true density grows away from the
-    // axis. The function ignores the growth, so that the cut does not depend on the
-    // camera's rotation.
+    // axis. This growth is ignored, so that the cut does not depend on the camera's
+    // rotation.
     V3DG_HD T px2_per_steradian() const { return fx * fy; }
 
     template <class Eye>
@@ -167,7 +167,7 @@ struct Pinhole {
         FrustumSides sides;
         for (int side = 0; side < 4; ++side) {
             const bool is_x = side < 2, is_positive = side % 2 == 0;
-            double linearised[2];  // up to this slope the Jacobian is exact
+            double linearised[2];  // slope up to which the Jacobian is exact
             for (int k = 0; k < num_eyes; ++k) {
                 const Eye& eye = eyes[k];
                 const double focal = is_x ? eye.fx : eye.fy;
@@ -198,7 +198,7 @@ struct Pinhole {
     static V3DG_HD void set_planes(const FrustumSides& sides, const InstanceAxes& first,
                                    const InstanceAxes& second, double front_offset,
                                    Plane plane[kNumPlanes]) {
-        // A point is outside of the near plane if its depth is less than near_depth.
+        // A point is outside the near plane if its depth is less than near_depth.
         Plane& front = plane[0];
         for (int k = 0; k < 3; ++k) front.normal[k] = static_cast<float>(-first.axes[6 + k]);
         front.offset = static_cast<float>(front_offset);
@@ -218,8 +218,8 @@ struct Pinhole {
     }
 
   private:
-    // Returns whether the optical axis is inside the clamped range. Then clamping moves
-    // slopes towards the axis, as half_of_sphere() assumes.
+    // Returns whether the optical axis is inside the clamped range. If it is, clamping
+    // moves slopes towards the axis, as half_of_sphere() assumes.
     static V3DG_HD V3DG_INLINE bool sees_its_axis(const SlopeLimits<T>& limits) {
         return limits.low_x < 0 && limits.high_x > 0 && limits.low_y < 0 && limits.high_y > 0;
     }

@@ -8,11 +8,11 @@ namespace v3dg {
 
 class PixelSlopes {
   public:
-    explicit PixelSlopes(const Pinhole<double>& camera) : camera_(camera) {}
+    V3DG_HD explicit PixelSlopes(const Pinhole<double>& camera) : camera_(camera) {}
 
-    double x_of(double column) const { return (column + 0.5 - camera_.cx) / camera_.fx; }
-    double y_of(double row) const { return (row + 0.5 - camera_.cy) / camera_.fy; }
-    double near_depth() const { return camera_.near_depth; }
+    V3DG_HD double x_of(double column) const { return (column + 0.5 - camera_.cx) / camera_.fx; }
+    V3DG_HD double y_of(double row) const { return (row + 0.5 - camera_.cy) / camera_.fy; }
+    V3DG_HD double near_depth() const { return camera_.near_depth; }
 
   private:
     Pinhole<double> camera_;

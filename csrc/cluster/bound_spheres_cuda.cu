@@ -1,7 +1,7 @@
-// Bounding balls on CUDA. All segments are processed in lockstep. In each pass, blocks
-// find the sphere of each segment that reaches farthest from the current centre. Then
-// one warp per segment adds this sphere to the core set and moves the centre. A
-// finished segment costs only the test of a flag.
+// Computes bounding balls on CUDA. All segments are processed in lockstep. In each
+// pass, blocks find the sphere of each segment that extends farthest from the current
+// centre. One warp per segment then adds this sphere to the core set and moves the
+// centre. A finished segment only costs the test of a flag.
 
 #include <vector>
 
@@ -14,7 +14,7 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kBlockSize = 128, kWarps = kBlockSize / 32;
-constexpr size_t kChunkSize = 4096;  // spheres that a block searches
+constexpr size_t kChunkSize = 4096;  // number of spheres that a block searches
 static_assert(kCoreSize <= 32, "each of 32 lanes holds one sphere of the core set");
 
 enum class Phase : int { search, measure, done };
@@ -27,8 +27,8 @@ struct Search {
     Phase phase;
 };
 
-// A sphere of a segment, and the distance of its farthest point. Of equal distances,
-// the lower index counts.
+// A sphere of a segment, and the distance of its farthest point. If distances are
+// equal, the sphere with the lower index is chosen.
 struct Farthest {
     double distance;
     uint32_t index;
@@ -59,7 +59,7 @@ __global__ void start_kernel(const Ball* spheres, const int64_t* offset, size_t 
     searches[s] = search;
 }
 
-// One block per chunk of a segment.
+// Launched with one block per chunk of a segment.
 __global__ void farthest_kernel(const Ball* spheres, const int64_t* offset,
                                 const uint32_t* segment_of_chunk, const uint32_t* first_chunk,
                                 const Search* searches, Farthest* found) {
@@ -85,8 +85,8 @@ __global__ void farthest_kernel(const Ball* spheres, const int64_t* offset,
     }
 }
 
-// Moves `center` towards the centre of the smallest ball around a core set: lane i of
-// the first `count` lanes holds sphere i. Returns the radius of that ball.
+// Moves `center` towards the centre of the smallest ball around a core set. The first
+// `count` lanes each hold one sphere of it. Returns the radius of that ball.
 __device__ double center_core(const Ball& mine, int count, Center& center) {
     const unsigned lane = threadIdx.x % 32;
     const auto find = [&](const Center& place) {
@@ -111,7 +111,7 @@ __device__ double center_core(const Ball& mine, int count, Center& center) {
     return best_radius;
 }
 
-// Performs one pass for each segment. One warp per segment.
+// Performs one pass for each segment. Launched with one warp per segment.
 __global__ void advance_kernel(const Ball* spheres, const int64_t* offset, size_t num_segments,
                                const uint32_t* first_chunk, const Farthest* found, double margin,
                                Search* searches, Ball* cores, Ball* balls) {
@@ -182,8 +182,8 @@ void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double 
     DeviceBuffer<Farthest> farthest_of_chunk(segment_of_chunk.size(), stream);
     launch("bound_spheres: start", start_kernel, blocks_for(num_segments, kBlockSize), kBlockSize,
            0, stream, spheres.data, offsets.data(), num_segments, searches.data(), ball.data);
-    // The core set has two spheres initially, and gains one per pass. Two more passes
-    // measure the core set and compute the radius.
+    // The core set initially has two spheres, and gets one more per pass. Two more
+    // passes measure the core set and compute the radius.
     for (int pass = 0; pass < kCoreSize + 1; ++pass) {
         launch("bound_spheres: farthest", farthest_kernel,
                static_cast<unsigned>(segment_of_chunk.size()), kBlockSize, 0, stream, spheres.data,

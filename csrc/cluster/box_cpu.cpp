@@ -1,4 +1,4 @@
-// One thread computes one box at a time.
+// Each thread computes one box at a time.
 
 #include "cluster/box.h"
 

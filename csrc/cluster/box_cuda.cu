@@ -1,4 +1,4 @@
-// One warp computes one box.
+// Each warp computes one box.
 
 #include "base/launch.cuh"
 #include "cluster/box.h"

@@ -1,7 +1,7 @@
 #pragma once
 
 // The box of one gaussian, for the CPU and CUDA. It is compiled without floating-point
-// contraction, so that the CPU and CUDA compute the same bits.
+// contraction, so that both compute the same bits.
 
 #include <cmath>
 
@@ -10,8 +10,8 @@
 
 namespace v3dg {
 
-// Returns the box of what one gaussian draws. The computation is in double precision,
-// because scales of one gaussian may be as different as 1e-6 and 1e6.
+// Returns the box of one gaussian as it is drawn. The computation is in double
+// precision, because the scales of a gaussian may differ as much as 1e-6 and 1e6.
 V3DG_HD inline Box box_of_gaussian(const float* mean, const float* quat, const float* scale) {
     const double q[4] = {quat[0], quat[1], quat[2], quat[3]};
     double r[9];

@@ -72,8 +72,8 @@ class Checker {
             "the level before, or one more");
     }
 
-    // Checks that the groups form trees: a group replaces the clusters of one page, and
-    // makes clusters of the next level, which all have the same parent.
+    // Checks that the groups form trees. A group replaces the clusters of one page, and
+    // makes clusters of the next level. All of these have the same parent.
     void check_tree() const {
         check_links("clusters.own_group", t_.own_group, t_.level, 0, 0);
         check_links("clusters.parent_group", t_.parent_group, t_.level, last_level_, 1);
@@ -82,8 +82,8 @@ class Checker {
             [&](size_t g) { return t_.group_level[g] >= 1 && t_.group_level[g] <= last_level_; },
             "1 to " + std::to_string(last_level_));
         check_links("groups.parent", t_.parent, t_.group_level, last_level_, 1);
-        // Clusters of the last level have no parent. They come last, as if their parent
-        // were group num_groups_.
+        // Clusters of the last level have no parent. They come last, so treat their
+        // parent as group num_groups_.
         check_ascends(
             "clusters.parent_group", num_clusters_,
             [&](size_t c) {
@@ -169,8 +169,9 @@ class Checker {
     }
 
   private:
-    // Checks the groups that rows refer to. Rows of level `without` must refer to none.
-    // The level of the other rows' groups must be the row's level plus `above`.
+    // Checks the groups that rows refer to. Rows of level `without` must not refer to
+    // any group. The group of any other row must be `above` levels above the row's
+    // level.
     void check_links(const char* table, Span<const int32_t> links, Span<const int32_t> level,
                      int32_t without, int above) const {
         const auto wanted = [&](size_t row) { return int64_t{level[row]} + above; };

@@ -10,9 +10,9 @@
 
 namespace v3dg {
 
-// The tables of a bundle with C clusters and G groups. Clusters are ordered by level,
+// The tables of a bundle with C clusters and G groups. Clusters are sorted by level,
 // then by parent group. Groups are in the order of the clusters that they replace. The
-// group -1 means none.
+// group -1 means no group.
 struct GivenTables {
     Span<const int64_t> offset;        // [C + 1]
     Span<const int32_t> level;         // [C]
@@ -30,15 +30,15 @@ struct GivenTables {
 
 // The first wrong row of a table. Row -1 means the last row.
 struct TableFault {
-    // Name of the table in files; "groups" if a group has no clusters.
+    // Name of the table in files, or "groups" if a group has no clusters.
     std::string table;
     int64_t row;
     std::string expected;
 };
 
-// Throws TableFault unless the tables are valid. They may have any contents. For exact
-// cuts, the ball and the weight of a group must not be smaller than the ball and the
-// weight of any group below it, so that the metric never decreases towards the root.
+// Throws TableFault unless the tables are valid; they may have any contents. Cuts are
+// only exact if the metric never decreases towards the root. Therefore the ball and the
+// weight of a group must not be smaller than those of any group below it.
 void check_tables(const GivenTables& tables, int64_t num_gaussians);
 
 }  // namespace v3dg

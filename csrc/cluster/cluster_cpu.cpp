@@ -1,6 +1,6 @@
-// Clustering on the CPU. The median split halves all large nodes of a level in
-// parallel, then those of the next level; one thread splits a small node down to its
-// leaves. A bounding ball is computed by one thread.
+// Clustering on the CPU. The median split first halves all large nodes of a level in
+// parallel, then those of the next level. A single thread splits a small node down to
+// its leaves. Each bounding ball is computed by one thread.
 
 #include "cluster/cluster.h"
 
@@ -36,7 +36,7 @@ struct IndexedPoint {
     uint32_t index;
 };
 
-// Nodes of at most this many points are split by one thread.
+// A node with at most this many points is split by a single thread.
 constexpr ptrdiff_t kTaskSize = 16384;
 
 // The points of a node, which has 2^depth leaves.

@@ -14,11 +14,12 @@ struct Point {
 };
 
 // The relative margin by which a ball contains the balls below it. It exceeds the
-// rounding error of a footprint in float32 (about 1e-6), so that footprints have the
-// order of balls.
+// rounding error of a footprint in float32 (about 1e-6), so that larger balls have
+// larger footprints.
 constexpr double kNestingMargin = 4e-6;
 
-// The smallest radius of a ball. Squares of it are normal numbers, with full precision.
+// The smallest radius of a ball. Its square is a normal number and thus has full
+// precision.
 constexpr float kMinRadius = 1e-15f;
 
 // Returns the number of points in the left half of a node: half of the node's points,
@@ -39,17 +40,17 @@ V3DG_HD inline double reach(const Center& center, const Ball& sphere) {
     return sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
 }
 
-// The smallest ball around many spheres is approximately the smallest ball around a few
-// of them, the core set. The sphere that is farthest from the current centre is added
-// to the core set repeatedly (Badoiu and Clarkson, Smaller core-sets for balls, SODA
-// 2003).
+// The maximum size of the core set. The smallest ball around many spheres is
+// approximately the smallest ball around a few of them, the core set. It is found by
+// repeatedly adding the sphere that is farthest from the current centre (Badoiu and
+// Clarkson, Smaller core-sets for balls, SODA 2003).
 constexpr int kCoreSize = 24;
 constexpr int kFirstCoreStep = 2, kLastCoreStep = 255;
 constexpr double kCoreTolerance = 1e-4;
 
 // Moves the centre of a core set towards the sphere whose farthest point has the
-// distance `radius`. Returns false if centre and sphere are concentric: there is no
-// direction then.
+// distance `radius`. Returns false if they are concentric, so that there is no
+// direction.
 V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
@@ -61,8 +62,8 @@ V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, C
     return true;
 }
 
-// Returns whether the ball of the core set contains all spheres, within the tolerance,
-// or the core set is full.
+// Returns whether the core set is full, or its ball contains all spheres within the
+// tolerance.
 V3DG_HD inline bool core_suffices(double radius, double core_radius, int core_size) {
     return radius <= core_radius * (1.0 + kCoreTolerance) || core_size == kCoreSize;
 }

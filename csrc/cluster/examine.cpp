@@ -13,7 +13,7 @@ namespace {
 constexpr size_t kGaussiansAtOnce = 4096;
 
 bool are_finite(const float* values, size_t count) {
-    // Counts without an early exit, so that the loop is vectorised.
+    // The loop counts without an early exit, so that it is vectorised.
     size_t num_finite = 0;
     for (size_t k = 0; k < count; ++k)
         num_finite += std::abs(values[k]) <= std::numeric_limits<float>::max() ? 1 : 0;

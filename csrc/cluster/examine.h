@@ -23,11 +23,12 @@ enum Finding : uint16_t {
     kTransparent = 1 << 8,  // valid, but invisible
 };
 
-// The largest coordinate or scale, in world units. The square of a larger one exceeds
-// the range of float32.
+// The largest coordinate or scale, in world units. Squares of larger values would
+// overflow float32.
 constexpr float kMostLength = 1e18f;
 
-// Computes the findings of all gaussians, [N]. 0 means that a gaussian can be drawn.
+// Computes the findings of all gaussians, [N]. A gaussian with the value 0 can be
+// drawn.
 void examine(const GaussianRows<const float>& in, Span<uint16_t> findings);
 
 }  // namespace v3dg

@@ -1,11 +1,11 @@
-// The median split on CUDA. It processes one level of the tree at a time, all nodes
-// together.
+// The median split on CUDA. It processes one level of the tree at a time, with all
+// nodes together.
 //
-// There are four lists of point indices. Within each node, three are sorted by x, y and
-// z, and by index for equal coordinates; the fourth is sorted by index. So the extent
-// of a node is the difference of two values, and its median is the middle of a list. A
-// split is a stable partition of all lists. In the end, the fourth list is the order
-// within leaves.
+// There are four lists of point indices. Three of them are sorted, within each node, by
+// x, y and z (equal coordinates by index). The fourth is sorted by index. Therefore the
+// extent of a node is the difference of two values, and its median is in the middle of
+// a list. A split is a stable partition of all lists. At the end, the fourth list has
+// the order within the leaves.
 
 #include <cub/device/device_radix_sort.cuh>
 
@@ -23,7 +23,7 @@ namespace {
 
 constexpr unsigned kNumLists = 4, kByIndex = 3;  // list l begins at l * count
 constexpr unsigned kBlockSize = 256;
-// A block partitions one tile of a list. A warp processes 32 points at a time.
+// A block partitions one tile of a list, and a warp processes 32 points at a time.
 constexpr unsigned kWordsPerTile = 64;
 constexpr unsigned kTileSize = 32 * kWordsPerTile;
 
@@ -34,7 +34,7 @@ struct Node {
 };
 
 // Returns the last of the nodes `low` to `high` that begins at or before `position`.
-// This node is never empty.
+// That node is never empty.
 __device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size_t position) {
     while (low < high) {
         const uint32_t middle = low + (high - low + 1) / 2;
@@ -63,8 +63,8 @@ __device__ NodeRange nodes_of_tile(const Node* nodes, uint32_t num_nodes, size_t
     return {found[0], found[1]};
 }
 
-// Computes keys for sorting along one axis: the segment, then the coordinate. -0 and 0
-// have equal keys.
+// Computes keys for sorting along one axis, from the segment and the coordinate. -0 and
+// 0 have equal keys.
 __global__ void keys_kernel(const Point* means, size_t count, const Node* segments,
                             uint32_t num_segments, int axis, uint64_t* keys, uint32_t* indices) {
     const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
@@ -98,7 +98,7 @@ __global__ void longest_axis_kernel(const Point* means, const Node* nodes, uint3
     axis_of_node[n] = static_cast<uint8_t>(longest);
 }
 
-// Computes for each point whether it goes to the left half of its node.
+// For each point, computes whether it goes to the left half of its node.
 __global__ void side_kernel(const Node* nodes, uint32_t num_nodes, const uint8_t* axis_of_node,
                             const uint32_t* lists, size_t count, uint8_t* goes_left) {
     const NodeRange range = nodes_of_tile(nodes, num_nodes, blockIdx.x, count);
@@ -110,8 +110,8 @@ __global__ void side_kernel(const Node* nodes, uint32_t num_nodes, const uint8_t
     }
 }
 
-// Writes the sides of the points in the order of each list, one bit per position. Also
-// counts the points of each tile that go to the left half.
+// Writes, for each list in its order, which half each point goes to, with one bit per
+// position. Also counts the points of each tile that go to the left half.
 __global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t count,
                              const uint8_t* goes_left, uint32_t* words, uint32_t* tile_lefts) {
     const size_t list = first_list + blockIdx.y;
@@ -134,7 +134,8 @@ __global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t 
     }
 }
 
-// Replaces the counts of each list's tiles by prefix sums. One block per list.
+// Replaces the counts of each list's tiles by prefix sums. Launched with one block per
+// list.
 __global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* tile_lefts) {
     uint32_t* values = tile_lefts + size_t(first_list + blockIdx.x) * num_tiles;
     uint32_t before = 0;
@@ -251,7 +252,7 @@ void median_split(Span<const Point> means, Span<const int64_t> offset, int depth
     DeviceBuffer<uint32_t> words(kNumLists * size_t(tiles) * kWordsPerTile, stream);
     DeviceBuffer<uint32_t> tile_lefts(kNumLists * size_t(tiles), stream);
     for (int level = 0; level < depth; ++level) {
-        // After the last split, the lists along the axes are not needed.
+        // After the last split, the lists along the axes are no longer needed.
         const unsigned first_list = level + 1 == depth ? kByIndex : 0;
         const unsigned num_lists = kNumLists - first_list;
         launch("median_split: longest axis", longest_axis_kernel, blocks_for(num_nodes, kBlockSize),

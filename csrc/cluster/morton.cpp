@@ -9,8 +9,9 @@
 
 namespace v3dg {
 
-constexpr size_t kChunk = 4096;  // points that a thread processes together
-constexpr int kBits = 21;        // bits per coordinate: three coordinates fit into 64 bits
+constexpr size_t kChunk = 4096;  // number of points that a thread processes together
+constexpr int kBits = 21;        // bits per coordinate, so that three coordinates fit
+                                 // into 64 bits
 
 void morton_order(Span<const Point> points, Span<int64_t> order) {
     Point low = points.empty() ? Point{} : points[0], high = low;
@@ -19,7 +20,7 @@ void morton_order(Span<const Point> points, Span<int64_t> order) {
             low.axis[a] = std::min(low.axis[a], point.axis[a]);
             high.axis[a] = std::max(high.axis[a], point.axis[a]);
         }
-    // Pairs of code and index, so that equal codes are ordered by index.
+    // The keys are pairs of code and index, so that equal codes are ordered by index.
     std::vector<std::pair<uint64_t, int64_t>> keys(points.size);
     parallel_for(points.size, kChunk, [&](size_t i) {
         uint64_t code = 0;

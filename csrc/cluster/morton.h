@@ -1,6 +1,6 @@
 #pragma once
 
-// The order of points along a Morton curve.
+// Sorts points along a Morton curve.
 
 #include <cstdint>
 
@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// Computes the order of points along a Morton curve, so that adjacent points in the
-// order are close in space. Every run gives the same order. Points must be finite.
+// Computes the order of points along a Morton curve. Adjacent points in this order are
+// close in space. Every run gives the same order. Points must be finite.
 void morton_order(Span<const Point> points, Span<int64_t> order);
 
 }  // namespace v3dg

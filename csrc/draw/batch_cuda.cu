@@ -74,7 +74,7 @@ std::unique_ptr<BatchDrawing> SceneFrame::draw_batch(const SceneTables& scene,
 }
 
 void SceneFrame::halve_parts(uint32_t num_cameras) {
-    most_cameras_ = std::max(num_cameras / 2, 1u);
+    part_limit_.halve(num_cameras);
     frame_.release_buffers();
 }
 
@@ -124,10 +124,17 @@ std::unique_ptr<Drawing> SceneFrame::draw_part(const BatchDrawing& batch, uint32
                     .second = {},
                     .num_pixels = num_pixels},
         .sensed_scene = {.scene = &scene, .num_slots = views.num_slots, .cameras = views.cameras}};
+    const ClippedPictures clipped{.sensors = of_cameras.sensors,
+                                  .cameras = views.cameras,
+                                  .count = count,
+                                  .width = request.width,
+                                  .height = request.height};
     return frame_.draw(
         of_cameras,
-        [this, &scene, views, rule = request.rule, out](const ItemList& items, cudaStream_t on) {
+        [=, this, &scene, &seen, rule = request.rule](const ItemList& items, cudaStream_t on) {
             cut_.cut_batch(scene, views, rule, out, items, on);
+            if (clipped.is_on())
+                clipped_.mark_scene(scene, seen, clipped, drawn_models(), rule, nullptr, on);
         },
         stream);
 }
@@ -145,9 +152,11 @@ BatchDrawing::BatchDrawing(SceneFrame& frame, const SceneTables& scene, const Ba
 
 void BatchDrawing::enqueue(uint32_t first, uint32_t count) {
     const SeenBounds& seen = seen_of(scene_, arrays_);
-    const uint32_t end = first + count;
+    const uint32_t end = first + count, wanted = cameras_of_part(request_, seen);
+    // A captured batch has the parts of the batch that was drawn before the capture.
+    if (!is_captured_) frame_.part_limit_.begin_batch(std::min(wanted, count));
     while (first < end) {
-        const uint32_t most = std::min(cameras_of_part(request_, seen), frame_.most_cameras_);
+        const uint32_t most = std::min(wanted, frame_.part_limit_.most_cameras());
         const uint32_t size = std::min(most, end - first);
         try {
             parts_.push_back(

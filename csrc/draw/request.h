@@ -46,15 +46,14 @@ struct FrameRequest {
     // For each bundle, the colours of its clusters in host memory, as SH coefficients
     // of degree 0, [C][3]. If the vector is empty, the gaussians keep their colours.
     std::vector<const float*> cluster_colors = {};
-    // Channels other than colour, and meshes. Only with a single eye.
+    // Channels other than colour, and the meshes of the eyes, one after another.
     SensorRequest sensor = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
     // Returns whether every backend can draw the request. Other requests can only be
     // drawn on the host.
     bool is_plain() const {
-        return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty() &&
-               !sensor.channels.clipped;
+        return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
     }
 };
 

@@ -109,6 +109,22 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
     return {{left, right}, 2, min_transmittance};
 }
 
+ClippedPictures clipped_pictures(const Eyes& eyes, const EyeImages& pictures,
+                                 const FrameSensors& sensors) {
+    return {.sensors = sensors,
+            .cameras = nullptr,
+            .eye = {eyes.camera[0], eyes.camera[1]},
+            .count = pictures.count,
+            .width = pictures.image[0].width,
+            .height = pictures.image[0].height};
+}
+
+DrawnModels SceneFrame::drawn_models() const {
+    return {.rows = rows_.data(),
+            .packed = has_packed_ ? packed_.data() : nullptr,
+            .coded = has_coded_ ? coded_.data() : nullptr};
+}
+
 FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures,
                              const SelectRule& rule, const FrameSensors& sensors,
                              cudaStream_t stream) {
@@ -155,6 +171,11 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, DevicePages*
     return draw_selected(scene, eyes, rule, pictures, sensors, stream, place);
 }
 
+// Returns where a cut writes the tolerance of a budget; null without a budget.
+static const CutChoice* choice_of(const SelectRule& rule, const ItemList& items) {
+    return rule.budget == kNoBudget ? nullptr : &items.counters->choice;
+}
+
 std::unique_ptr<Drawing> SceneFrame::draw_selected(const SceneTables& scene, const Eyes& eyes,
                                                    const SelectRule& rule,
                                                    const EyeImages& pictures,
@@ -165,6 +186,10 @@ std::unique_ptr<Drawing> SceneFrame::draw_selected(const SceneTables& scene, con
         [=, this, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on);
+            if (sensors.wants_clipped())
+                clipped_.mark_scene(scene, scene.seen_by_all(),
+                                    clipped_pictures(eyes, pictures, sensors), drawn_models(), next,
+                                    choice_of(next, items), on);
             next = drawn_again(next);
         },
         stream, place);
@@ -189,6 +214,11 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
         [=, this, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
+            if (sensors.wants_clipped())
+                clipped_.mark_scene(scene, scene.seen_by_all(),
+                                    clipped_pictures(eyes, pictures, sensors),
+                                    {nullptr, pages.packed(), pages.coded()}, next,
+                                    choice_of(next, items), on, &resident);
             next = drawn_again(next);
             // A frame that is drawn again must not report page requests, because the
             // next frame may already be reporting its own.
@@ -213,6 +243,9 @@ std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene,
         [=, this, &scene, camera = request.eyes.camera[0]](const ItemList& items, cudaStream_t on) {
             cut_.given_items(scene, camera, given, pictures.image[0], images_.data(),
                              placements_.data(), items, on);
+            if (sensors.wants_clipped())
+                clipped_.mark_given(scene, clipped_pictures(camera, pictures, sensors),
+                                    drawn_models(), given, on);
         },
         stream, place);
 }
@@ -221,7 +254,7 @@ std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
     auto parts = frame_.bytes();
     const size_t tables = rows_.bytes() + packed_.bytes() + coded_.bytes() + images_.bytes();
     parts.emplace_back("placements", placements_.bytes() + factors_.bytes() + tables);
-    parts.emplace_back("cut", cut_.bytes());
+    parts.emplace_back("cut", cut_.bytes() + clipped_.bytes());
     return parts;
 }
 
@@ -250,7 +283,8 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
                                           bool antialiased, const FrameImage& image,
                                           cudaStream_t stream, const PackedPlanes* packed,
                                           float min_transmittance, const Frame::Place& place,
-                                          const FrameSensors& sensors) {
+                                          const FrameSensors& sensors,
+                                          const ClippedPictures& clipped) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
     const ModelTables tables{
@@ -272,6 +306,9 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
         [=](const ItemList& items, cudaStream_t on) {
             launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device,
                    Appearance<float>{filter_px2, antialiased, false}, items);
+            const DrawnModels models{batch.models, batch.packed, nullptr};
+            if (clipped.is_on())
+                ClippedPass::mark_model(clipped, models, view, tables.rows.size, on);
         },
         stream, place);
 }

@@ -3,8 +3,10 @@
 // Draws frames of a scene on a CUDA device by enqueuing the work of a request. Also has
 // the models that frames draw.
 
+#include "draw/clipped.h"
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
+#include "draw/part_limit.h"
 #include "draw/request.h"
 #include "quantize/quantize.h"
 #include "select/select_cuda.h"
@@ -69,6 +71,10 @@ class DevicePalette {
     DeviceBuffer<float> sh_;
 };
 
+// Returns the pictures of eyes with their channels.
+ClippedPictures clipped_pictures(const Eyes& eyes, const EyeImages& pictures,
+                                 const FrameSensors& sensors);
+
 // Combines the pictures of two eyes in one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
@@ -124,7 +130,7 @@ class SceneFrame {
     // Draws cameras [first, first + count) of a batch.
     std::unique_ptr<Drawing> draw_part(const BatchDrawing& batch, uint32_t first, uint32_t count,
                                        CameraSource source);
-    // Halves the number of cameras in all later parts.
+    // Halves the number of cameras of later parts (part_limit.h).
     void halve_parts(uint32_t num_cameras);
 
     std::unique_ptr<Drawing> draw_selected(const SceneTables& scene, const Eyes& eyes,
@@ -138,6 +144,8 @@ class SceneFrame {
     std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const FrameRequest& request,
                                         const EyeImages& pictures, const FrameSensors& sensors,
                                         cudaStream_t stream, const Frame::Place& place);
+    // Returns the models that a frame without a pool draws.
+    DrawnModels drawn_models() const;
     // Returns the input of a frame that draws the models.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                      const FrameSensors& sensors, cudaStream_t stream);
@@ -151,11 +159,12 @@ class SceneFrame {
     DeviceBuffer<Placement> placements_;
     DeviceBuffer<InstanceFactors> factors_;  // one element per instance slot of a batch
     DeviceBuffer<FrameImage> images_;
-    uint32_t most_cameras_ = ~0u;                       // maximum number of cameras in a part
+    PartLimit part_limit_;
     std::vector<std::shared_ptr<BatchTables>> tables_;  // memory of batches
     // Memory that captured graphs still use.
     std::vector<std::shared_ptr<BatchTables>> captured_tables_;
     Cut cut_;
+    ClippedPass clipped_;
     Frame frame_;
 };
 
@@ -219,7 +228,8 @@ class ModelFrame {
                                   const FrameImage& image, cudaStream_t stream,
                                   const PackedPlanes* packed = nullptr,
                                   float min_transmittance = kStopsBefore,
-                                  const Frame::Place& place = {}, const FrameSensors& sensors = {});
+                                  const Frame::Place& place = {}, const FrameSensors& sensors = {},
+                                  const ClippedPictures& clipped = {});
     FrameTape tape() const { return frame_.tape(); }
 
   private:

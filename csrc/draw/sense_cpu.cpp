@@ -8,6 +8,7 @@
 #include "base/parallel_for.h"
 #include "base/stop.h"
 #include "quantize/quantize_math.h"
+#include "rasterize/clipped_math.h"
 #include "rasterize/sense.h"
 #include "rasterize/sense_math.h"
 
@@ -89,18 +90,6 @@ SensedRecords sensed_records(const std::vector<Draw<float>>& draws, const DrawnS
     return sensed;
 }
 
-// Returns the axes of a gaussian in view space, as columns of a row-major matrix.
-void axes_of(const Gaussian3d<float>& g, const ModelView<float>& view, double axes[9]) {
-    float r[9];
-    rotation_of_quat(g.quat, r);
-    for (int i = 0; i < 3; ++i)
-        for (int k = 0; k < 3; ++k) {
-            double sum = 0;
-            for (int j = 0; j < 3; ++j) sum += double(view.linear[3 * i + j]) * r[3 * j + k];
-            axes[3 * i + k] = sum * g.scale[k];
-        }
-}
-
 // Appends the clipped bodies among some gaussians of a draw.
 void add_bodies(const Draw<float>& draw, uint64_t first, uint64_t last, double near_depth,
                 std::vector<ClippedBody>& bodies) {
@@ -111,7 +100,7 @@ void add_bodies(const Draw<float>& draw, uint64_t first, uint64_t last, double n
         if (!(p[2] < static_cast<float>(near_depth))) continue;
         const double mean[3] = {p[0], p[1], p[2]};
         double axes[9];
-        axes_of(g, draw.view, axes);
+        axes_in_view(g, draw.view, axes);
         ClippedBody body;
         const double opacity = double(g.opacity) * draw.weight;
         if (set_clipped_body(mean, axes, opacity, near_depth, body)) bodies.push_back(body);

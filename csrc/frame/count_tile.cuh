@@ -17,8 +17,8 @@ __device__ inline void count_tile(uint32_t* count, uint32_t tile) {
         atomicAdd(count + tile, unsigned(__popc(peers)));
 }
 
-// A queue of tiles to count. It holds every tile of a record except the first. A warp
-// counts tiles when the queue has 32.
+// A queue of tiles to count. It receives every tile of a record except the first one. A
+// warp counts the queued tiles when there are 32 of them.
 struct WaitingTiles {
     uint32_t tile[31 + 32 * (kFewTiles - 1)];
     unsigned count;
@@ -38,8 +38,9 @@ __device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& a
     }
 }
 
-// Counts the first tile of each lane, and adds the lane's further tiles to the queue.
-// Counts queued tiles when there are 32. All lanes of the warp must call it.
+// Counts the first tile of each lane, and adds the lane's other tiles to the queue.
+// Counts the queued tiles when there are 32 of them. All lanes of the warp must call
+// it.
 template <class TileOf>
 __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& tile_of,
                             WaitingTiles& waiting) {

@@ -7,24 +7,24 @@
 namespace v3dg {
 namespace cuda {
 
-// The result of selecting a cut within a budget of gaussians: the tolerance that was
-// used. If even the coarsest cut exceeds the budget, nothing is selected, and `least`
-// is the number of gaussians of the coarsest cut.
+// The result of selecting a cut within a budget of gaussians. It has the tolerance that
+// was used. If even the coarsest cut exceeds the budget, nothing is selected, and
+// `least` is the number of gaussians in the coarsest cut.
 struct CutChoice {
     float tolerance_px2;
     bool exceeds_budget;
     unsigned long long least;
 };
 
-// Numbers of elements, in device memory; all start at 0. Elements beyond a capacity are
-// counted, but not stored; then nothing is drawn.
+// Numbers of elements, in device memory. All of them start at 0. Elements beyond a
+// capacity are counted, but not stored; nothing is drawn then.
 struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
-    // Large records or parts of them, including padding of batches.
+    // Large records or parts of them, including the padding of batches.
     unsigned long long large;
     unsigned long long spread;  // number of list entries that need scratch memory
-    unsigned long long slots;   // number of gradient slots, in a frame with a tape
-    CutChoice choice;           // valid if the cut has a budget
+    unsigned long long slots;   // number of gradient slots, for a frame with a tape
+    CutChoice choice;           // only valid if the cut has a budget
 };
 
 // The counts of one image, for frames that report counts of images.
@@ -40,19 +40,19 @@ struct Capacity {
         return items == other.items && records == other.records && large == other.large &&
                entries == other.entries && spread == other.spread;
     }
-    // Returns whether the buffers hold `num_items` items and `num_gaussians` gaussians.
-    // Like the next function it has no branches, so that a kernel loads all counters at
-    // once.
+    // Returns whether the buffers have room for `num_items` items and `num_gaussians`
+    // gaussians. This function and the next one have no branches, so that a kernel
+    // loads all counters at once.
     V3DG_HD bool holds_items(unsigned long long num_items, unsigned long long num_gaussians) const {
         return (num_items <= items) & (num_gaussians <= records);
     }
-    // Returns whether the buffers hold all counted elements, apart from
-    // FrameCounters::spread, which is counted later.
+    // Returns whether the buffers have room for all counted elements.
+    // FrameCounters::spread is ignored, because it is counted later.
     V3DG_HD bool holds_entries(const FrameCounters& counters) const {
         return holds_items(counters.items, counters.gaussians) & (counters.large <= large) &
                (counters.entries <= entries);
     }
-    // Returns whether the buffers hold all counted elements.
+    // Returns whether the buffers have room for all counted elements.
     V3DG_HD bool holds(const FrameCounters& counters) const {
         return holds_entries(counters) & (counters.spread <= spread);
     }

@@ -36,49 +36,49 @@ struct Draw {
     Appearance<T> appearance;
     Palette palette{};
     const Codes* codes = nullptr;
-    // factor of the opacities: the weight of the instance times the weight of a fade
+    // multiplies the opacities; the product of the instance's opacity and a fade's
+    // weight
     T weight = 1;
-    // [3] factors of red, green, blue; not applied to palettes; null: none
+    // [3] multiply red, green and blue, but not colours of palettes; may be null
     const float* color_factors = nullptr;
 };
 
 namespace cuda {
 
-// The largest number of records of an item, which equals the number of threads of a
-// block.
+// Maximum number of records of an item. It equals the number of threads of a block.
 constexpr int kItemSize = 256;
 constexpr unsigned kItemClusters = 8;
 
-// A model that is placed in front of the camera of one picture. The alignment lets a
-// thread write a placement in few instructions.
+// A model that is placed in front of the camera of one picture. Because of its
+// alignment, a thread can write a placement in few instructions.
 struct alignas(16) Placement {
     ModelView<float> view;
     uint32_t model, image;
 };
 
-// A run of adjacent gaussians of a model, to be drawn together. A shared item draws the
-// gaussians at several placements of the model in one picture: `placement` + k for each
-// bit k that is set in `sharers`. For other items `sharers` is 0.
+// A run of adjacent gaussians of a model that are drawn together. A shared item draws
+// them at several placements of the model in one picture: `placement` + k for each bit
+// k that is set in `sharers`. For all other items, `sharers` is 0.
 //
 // An item has at most kItemSize records. They begin at index `record`, and are ordered
 // by gaussian, then by placement. The first gaussian belongs to one of kItemClusters
-// clusters of the model, of which `cluster` is the first.
+// clusters of the model, the first of which is `cluster`.
 struct DrawItem {
     uint32_t placement, first, count, record;
     Appearance<float> appearance;
     uint32_t sharers, cluster;
-    float weight;  // factor of the opacities; below 1 in a fade
+    float weight;  // multiplies the opacities; below 1 in a fade
 };
 
-// The buffer for a frame's items. The kernel that writes items counts all items in
-// counters->items, but stores only as many as fit. counters->gaussians is the end of
-// the last item's records. Items whose records end beyond record_capacity may be left
-// out.
+// The buffer for a frame's items. The kernel that writes items counts all of them in
+// counters->items, but only stores as many as fit. counters->gaussians is the end of
+// the last item's records. Items whose records end beyond record_capacity may be
+// omitted.
 struct ItemList {
     DrawItem* items;
     FrameCounters* counters;
     unsigned long long item_capacity, record_capacity;
-    unsigned long long* zeros;  // zeroed memory that the writing kernel requested
+    unsigned long long* zeros;  // zeroed memory that the writing kernel needs
 
     V3DG_HD bool has_room_for(unsigned long long num_items,
                               unsigned long long num_gaussians) const {

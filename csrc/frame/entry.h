@@ -1,7 +1,7 @@
 #pragma once
 
-// An entry of a tile's list on the CPU: a record's depth, index and blocks in one
-// integer. The format on CUDA is in tile_list.h.
+// An entry of a tile's list on the CPU. One integer holds a record's depth, index and
+// blocks. tile_list.h has the format for CUDA.
 
 #include <cstdint>
 #include <cstring>
@@ -14,8 +14,8 @@ constexpr int kBlockSize = 4;  // width and height of a block of pixels
 constexpr int kTileBlocks = kTileSize / kBlockSize;
 
 // Tables that convert the range of block columns, or rows, of a box to a mask of the
-// tile's blocks. The index has the first column in its lower 3 bits and the last column
-// in its upper 3 bits. The mask has a bit per block, row by row.
+// tile's blocks. The lower 3 bits of the index are the first column, and the upper 3
+// bits the last column. The mask has one bit per block, row by row.
 struct BlocksOfBox {
     uint64_t columns[64] = {}, rows[64] = {};
     constexpr BlocksOfBox() {
@@ -31,16 +31,18 @@ struct BlocksOfBox {
 };
 inline constexpr BlocksOfBox kBlocksOfBox;
 
-// Returns the bits of a depth. For positive numbers, the bits compare like the numbers.
+// Returns the bits of a depth. Bits of positive floats have the same order as the
+// floats.
 V3DG_INLINE uint32_t depth_bits_of(float depth) {
     uint32_t bits;
     std::memcpy(&bits, &depth, sizeof bits);
     return bits;
 }
 
-// The bit layout of entries. From the highest bits down: the depth's bits minus the
-// smallest depth's bits, the index of the record, the record's box in the tile. If 64
-// bits are too few, the lowest bits of the depths are dropped.
+// The bit layout of entries. From the highest bit down, an entry has the bits of the
+// depth minus those of the smallest depth, the index of the record, and the record's
+// box in the tile. If 64 bits do not suffice, the lowest bits of the depths are
+// dropped.
 struct EntryFormat {
     static constexpr int kBoxBits = 12;
     int depth_shift = kBoxBits, dropped_bits = 0;

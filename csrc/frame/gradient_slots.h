@@ -1,6 +1,6 @@
 #pragma once
 
-// The memory in which a CUDA frame collects the gradients of its records: one slot per
+// The memory in which a CUDA frame collects the gradients of its records, one slot per
 // record and tile.
 
 #include "frame/tile_list.h"
@@ -8,13 +8,13 @@
 namespace v3dg {
 namespace cuda {
 
-// Gradient slots. Each record has one slot for each tile of its pixel box, row by row;
-// the sum of the slots is the record's gradient. A tile writes the slots of the records
-// that it blended, and marks these slots as touched. Other slots are undefined.
+// Gradient slots. Each record has one slot for each tile of its pixel box, row by row.
+// The gradient of a record is the sum of its slots. A tile writes the slots of the
+// records that it blended, and marks them as touched. All other slots are undefined.
 struct GradientSlots {
     const uint32_t* first;  // index of each record's first slot
     RecordGradient<float>* slot;
-    CenterSize<float>* size;  // absolute center gradients; null if not requested
+    CenterSize<float>* size;  // absolute gradients of centres; null if not requested
     uint8_t* is_touched;      // one per slot, initially zero
 };
 

@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-constexpr int kTileSize = 32;  // Width and height of a tile on the CPU, px.
+constexpr int kTileSize = 32;  // width and height of a tile on the CPU, px
 
 // The pixels of a picture that are drawn: x in [x0, x1) and y in [y0, y1).
 struct Window {
@@ -19,40 +19,42 @@ struct Window {
     V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
 };
 
-// The stop rule of gsplat. A pixel stops before a gaussian that would leave a
-// transmittance of at most kMinTransmittance. Neither this gaussian nor any behind it
+// The stop rule of gsplat. A pixel stops before a gaussian that would reduce its
+// transmittance to kMinTransmittance or less. Neither this gaussian nor any behind it
 // is blended.
 struct StopsBefore {};
-// The stop rule with a chosen transmittance. A pixel stops after the gaussian that
-// leaves this transmittance or less. The blend weights are then scaled up to fill the
-// transmittance that is left. So the error of a channel is at most `transmittance`
-// times the difference between the blended colour and the colour behind.
+// A stop rule with a chosen transmittance. A pixel stops after the gaussian that
+// reduces its transmittance to this value or less. The blend weights are then scaled
+// up, so that they also use the transmittance that is left. Therefore the error of a
+// channel is at most `transmittance` times the difference between the blended colour
+// and the colour behind it.
 template <class T>
 struct StopsBehind {
     T transmittance;
 };
 
-// The value of `min_transmittance` that selects StopsBefore; and the value that selects
-// StopsBehind with the transmittance that stop_of_tolerance() returns for the cut. Both
-// are negative; other values select StopsBehind.
+// Special values of `min_transmittance`. kStopsBefore selects StopsBefore. kStopsByCut
+// selects StopsBehind with the transmittance that stop_of_tolerance() returns for the
+// cut. Both are negative; other values select StopsBehind.
 constexpr float kStopsBefore = -1.0f, kStopsByCut = -2.0f;
 
-// Returns the transmittance behind which pixels of a cut stop. Up to the default
-// tolerance, where level 0 may be all that is drawn, it is that of kMinTransmittance,
-// with which assets are drawn. It grows with the square of the tolerance to a
-// thousandth, which costs nothing visible in cuts of 9.5 px² a gaussian or more.
+// Returns the transmittance at which pixels of a cut stop. Up to the default tolerance,
+// where a cut may consist of level 0 only, it is the value for assets,
+// kMinTransmittance. It then grows with the square of the tolerance up to a thousandth.
+// The difference is not visible in cuts of 9.5 px² per gaussian or more.
 V3DG_HD inline float stop_of_tolerance(float tolerance_px2) {
     constexpr float kLeast = 1e-4f, kMost = 1e-3f, kLeastTolerance = 3;
     const float ratio = tolerance_px2 / kLeastTolerance;
     return min_of(max_of(kLeast * (ratio * ratio), kLeast), kMost);
 }
 
-// Returns `min_transmittance`, for a cut of a tolerance if it is kStopsByCut.
+// Returns `min_transmittance`. If it is kStopsByCut, returns the value for a cut with
+// this tolerance.
 V3DG_HD inline float stop_of_cut(float min_transmittance, float tolerance_px2) {
     return min_transmittance == kStopsByCut ? stop_of_tolerance(tolerance_px2) : min_transmittance;
 }
 
-// `min_transmittance` may be kStopsByCut if draw() finds out the transmittance itself.
+// `min_transmittance` may be kStopsByCut if draw() computes the transmittance itself.
 template <class T, class Draw>
 V3DG_INLINE void with_stop(float min_transmittance, const Draw& draw) {
     if (min_transmittance == kStopsBefore)
@@ -61,33 +63,35 @@ V3DG_INLINE void with_stop(float min_transmittance, const Draw& draw) {
         draw(StopsBehind<T>{static_cast<T>(min_transmittance)});
 }
 
-// A picture to draw: the pixels of a window, row major. Colours have three channels.
+// A picture to draw: the pixels of a window, in row-major order. Colours have three
+// channels.
 template <class T>
 struct Picture {
     Window window;
     T background[3];
-    T* color;  // premultiplied by alpha, plus background
+    T* color;  // premultiplied by alpha, with the background added
     T* alpha;  // may be null
-    // Expected depth: the sum of weight * depth, divided by alpha; 0 if alpha is 0. May
-    // be null.
+    // Expected depth: the sum of weight * depth, divided by alpha, or 0 if alpha is 0.
+    // May be null.
     T* depth;
-    // Number of blended gaussians per pixel, drawn instead of depth. May be null.
+    // Number of blended gaussians per pixel, which is drawn instead of depth. May be
+    // null.
     T* count = nullptr;
     float min_transmittance = kStopsBefore;
-    // The distance between adjacent pixels, in floats, in `color` and in `alpha`.
+    // The distance between adjacent pixels in `color` and in `alpha`, in floats.
     int color_step = 3, alpha_step = 1;
 };
 
-// The memory of pictures of one size, one after another. With four channels, the colour
-// contains alpha, and `alpha` is null.
+// Planes that hold pictures of one size, one after another. With four channels, the
+// colour includes alpha, and `alpha` is null.
 struct BatchPlanes {
     float* color;  // (B, H, W, channels)
     int channels;  // 3 or 4
     float* alpha;  // (B, H, W), or null
     float* depth;  // (B, H, W), or null
 
-    // Returns the planes that begin at pixel `pixel`, which is counted over all
-    // pictures.
+    // Returns the planes with their pointers advanced to `pixel`, which is counted over
+    // all pictures.
     V3DG_HD BatchPlanes from(size_t pixel) const {
         return {.color = color + channels * pixel,
                 .channels = channels,
@@ -108,13 +112,13 @@ struct PictureGradient {
 
 namespace cuda {
 
-// The size of a tile on CUDA, px. A block of threads blends a tile, each warp four
-// rows.
+// The size of a tile on CUDA, px. A block of threads blends a tile, and each warp
+// blends four rows.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
-// The destination of a picture on CUDA (see Picture<float>). A frame may obtain it
-// after its first stages are enqueued.
+// The destination of a picture on CUDA (see Picture<float>). It may be set after the
+// first stages of a frame are enqueued.
 struct PicturePlanes {
-    // May be null: either all three, only alpha, or only depth.
+    // Either all three pointers, only `alpha`, or only `depth` may be null.
     float *color, *alpha, *depth;
     bool has_four_channels;  // alpha is the fourth channel of `color`
 };
@@ -134,12 +138,12 @@ V3DG_HD inline uint32_t num_tiles_of(const FrameImage& image) {
     return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
 }
 
-// The pictures of the one or two eyes of a scene's frame. The tiles of the second
-// picture follow the tiles of the first picture.
+// The pictures of a scene's frame, for one eye or two. The tiles of the second picture
+// follow those of the first.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;
-    float min_transmittance;  // the same for both pictures; may be kStopsByCut
+    float min_transmittance;  // used for both pictures; may be kStopsByCut
 };
 
 }  // namespace cuda

@@ -1,7 +1,7 @@
 #pragma once
 
-// Loads and stores records in kernels. A record consists of vectors of 16 bytes; the
-// last vector is half used.
+// Loads and stores records in kernels. A record consists of vectors of 16 bytes. Half
+// of the last vector is unused.
 
 #include <cstddef>
 
@@ -41,7 +41,7 @@ __device__ inline Record<float> record_of_vectors(const float4& a, const float4&
             .y1 = box.y1};
 }
 
-// Loads a record. The compiler omits loads of unused fields.
+// Loads a record. The compiler omits loads of fields that are not used.
 __device__ inline Record<float> load_record(const RecordPlanes& records, uint32_t record,
                                             const RecordBox& box) {
     const float4* ellipse = ellipse_of(records, record);

@@ -8,14 +8,14 @@
 
 namespace v3dg {
 
-// A gaussian in a picture. Ellipse documents u, v, L and log2_opacity.
+// A gaussian in a picture. Ellipse explains u, v, L and log2_opacity.
 template <class T>
 struct Record {
     T u, v, l11, l12, l22, log2_opacity;
     T color[3];
     T depth;
     // The first and last column and row of pixels whose centres the gaussian can reach,
-    // clipped to the image, or to its part that is drawn (Window in frame/image.h).
+    // clipped to the part of the image that is drawn (Window in frame/image.h).
     uint16_t x0, x1, y0, y1;
 };
 
@@ -41,8 +41,8 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.y1 = static_cast<uint16_t>(box.y1);
 }
 
-// The sum, over pixels, of the absolute gradient with respect to a gaussian's centre,
-// per axis. The sum is large even where the signed gradients of pixels cancel.
+// The sum over pixels of the absolute gradient with respect to a gaussian's centre, for
+// each axis. It is large even where the signed gradients of pixels cancel.
 template <class V>
 struct CenterSize {
     V u, v;
@@ -54,8 +54,8 @@ struct CenterSize {
     }
 };
 
-// The gradients with respect to the gaussians' centres, 1 / px: (N, 2) each. Either
-// array may be null.
+// Gradients with respect to the centres of gaussians, 1 / px, (N, 2) each. Either array
+// may be null.
 template <class T>
 struct CenterGradients {
     T* sum;

@@ -1,6 +1,6 @@
 #pragma once
 
-// Further channels of a picture beside colour, and the z-buffer of meshes that hide the
+// Channels of a picture other than colour, and the z-buffer of meshes that hide the
 // gaussians behind them. docs/sensors.md defines every channel.
 
 #include <cstddef>
@@ -10,34 +10,36 @@
 
 namespace v3dg {
 
-// Values of the channels of ids. Instances and labels are numbered from 0.
+// Special values of the channels of ids. Instances and labels are numbered from 0.
 constexpr int32_t kNoInstance = -1, kMeshInstance = -2, kNoLabel = -1;
 
-// Returns a plane of `width` numbers per pixel from pixel `pixel` on; null stays null.
+// Advances a plane with `width` numbers per pixel to `pixel`. A null pointer stays
+// null.
 template <class T>
 V3DG_HD T* plane_from(T* plane, size_t width, size_t pixel) {
     return plane == nullptr ? nullptr : plane + width * pixel;
 }
 
-// The channels of a picture, row major. Null planes are not computed.
+// The channels of a picture, in row-major order. A plane that is null is not computed.
 struct SensorPlanes {
-    // Depth of the gaussian behind which half of the light is gone; 0 if less is gone.
+    // Depth of the gaussian at which the transmittance falls to one half, or 0 if it
+    // stays larger.
     float* median_depth = nullptr;
     float* normal = nullptr;  // (H, W, 3) in view space, unit length or 0
     // The instance with the largest weight in a pixel, its label, and that weight.
     int32_t* instance = nullptr;
     int32_t* label = nullptr;
     float* weight = nullptr;
-    // 1 where a gaussian is missing because its centre is before the near plane.
+    // 1 where a gaussian is missing because its centre is in front of the near plane.
     uint8_t* clipped = nullptr;
 
     V3DG_HD bool wants_ids() const { return instance != nullptr || label != nullptr; }
     V3DG_HD bool wants_strongest() const { return wants_ids() || weight != nullptr; }
-    // Returns whether any channel is found by walking the list of a tile.
+    // Returns whether any channel requires the sensor pass.
     V3DG_HD bool wants_walk() const {
         return median_depth != nullptr || normal != nullptr || wants_strongest();
     }
-    // Returns the planes from pixel `pixel` on.
+    // Returns the planes with their pointers advanced to `pixel`.
     V3DG_HD SensorPlanes from(size_t pixel) const {
         return {.median_depth = plane_from(median_depth, 1, pixel),
                 .normal = plane_from(normal, 3, pixel),
@@ -48,21 +50,21 @@ struct SensorPlanes {
     }
 };
 
-// The light of the colours of meshes, in which they are mixed with those of gaussians.
+// The light in which colours of meshes are stored and mixed with those of gaussians.
 enum class MeshLight { display, linear };
 
-// The z-buffer of a picture of meshes, row major.
+// The z-buffer of a picture of meshes, in row-major order.
 struct MeshLayer {
     const float* color = nullptr;       // (H, W, 3) straight, not premultiplied
     const float* depth = nullptr;       // (H, W) in the unit of the gaussians' depths
     const float* coverage = nullptr;    // (H, W) from 0 to 1
-    const float* normal = nullptr;      // (H, W, 3) in view space; null: unknown
-    const int32_t* instance = nullptr;  // (H, W); null: kMeshInstance
-    const int32_t* label = nullptr;     // (H, W); null: kNoLabel
+    const float* normal = nullptr;      // (H, W, 3) in view space; null if unknown
+    const int32_t* instance = nullptr;  // (H, W); null means kMeshInstance
+    const int32_t* label = nullptr;     // (H, W); null means kNoLabel
     MeshLight light = MeshLight::display;
 
     V3DG_HD bool is_there() const { return depth != nullptr; }
-    // Returns the layer from pixel `pixel` on.
+    // Returns the layer with its pointers advanced to `pixel`.
     V3DG_HD MeshLayer from(size_t pixel) const {
         return {.color = plane_from(color, 3, pixel),
                 .depth = plane_from(depth, 1, pixel),
@@ -93,7 +95,7 @@ struct Channels {
     bool any() const { return median_depth || normal || instance || label || weight || clipped; }
 };
 
-// The request for channels, and the meshes among which the gaussians are.
+// The request for channels, and the meshes among the gaussians.
 struct SensorRequest {
     Channels channels;
     MeshLayer mesh;

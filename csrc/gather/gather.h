@@ -1,6 +1,7 @@
 #pragma once
 
-// Gathers the gaussians of the clusters of a cut, transformed into the world.
+// Copies the gaussians of the clusters of a cut into one array, transformed into the
+// world.
 
 #include <cstdint>
 
@@ -18,7 +19,7 @@ struct GatherInput {
     // [I] bundle of each instance
     Span<const int32_t> bundle;
     Span<const double> position;    // [I * 3]
-    Span<const double> quaternion;  // [I * 4] w x y z, of any length but zero
+    Span<const double> quaternion;  // [I * 4] w x y z, of any nonzero length
     Span<const double> scale;
     Span<const InstanceFactors> factors;  // empty if all are 1
     // [S] instance of each cluster
@@ -30,12 +31,13 @@ struct GatherInput {
 };
 
 // Writes the gaussians of all clusters in world coordinates, in order. SH coefficients
-// are rotated into the world and multiplied by the tint, both exactly; coefficients
-// that a bundle does not have are 0. Everything is computed in double precision. The
-// CPU and CUDA compute the same bits.
+// are rotated into the world and multiplied by the tint, which is exact. Coefficients
+// that a bundle does not have become 0. All computations are in double precision, and
+// the CPU and CUDA compute the same bits.
 namespace cpu { void gather(const GatherInput& in, const GaussianRows<float>& out); }
-// The rows of bundles and `out` are on the device, all other arrays in host memory.
-// Work is enqueued on the stream. Throws std::runtime_error if CUDA reports an error.
+// The rows of bundles and `out` are on the device, and all other arrays in host memory.
+// The work is enqueued on the stream. Throws std::runtime_error if CUDA reports an
+// error.
 namespace cuda {
 void gather(const GatherInput& in, const GaussianRows<float>& out, Stream stream);
 }

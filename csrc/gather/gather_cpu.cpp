@@ -1,4 +1,4 @@
-// A thread gathers one cluster at a time.
+// Each thread gathers one cluster at a time.
 
 #include "base/parallel_for.h"
 #include "gather/gather_math.h"

@@ -1,5 +1,5 @@
 // Gathers on CUDA. A thread writes the shape of a gaussian, or one of its SH bases. A
-// block processes adjacent rows, so that it looks up few clusters.
+// block processes adjacent rows, so that it needs to look up only a few clusters.
 
 #include "base/launch.cuh"
 #include "gather/gather.h"
@@ -12,7 +12,7 @@ namespace {
 
 constexpr unsigned kBlockSize = 256;
 
-// Returns the last of the clusters `low` to `high` that begins at or before `row`. This
+// Returns the last of the clusters `low` to `high` that begins at or before `row`. That
 // cluster is never empty.
 __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size_t high,
                              int64_t row) {
@@ -26,8 +26,8 @@ __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size
     return low;
 }
 
-// One thread per row of the result (num_items = 1), or per row and SH basis (num_items
-// = number of bases).
+// Launched with one thread per row of the result (num_items = 1), or per row and SH
+// basis (num_items = number of bases).
 __global__ void __launch_bounds__(kBlockSize)
     gather_kernel(GatherInput in, Rotations rotations, GaussianRows<float> out, int num_items) {
     const int64_t num = in.offset[in.instance.size] * num_items;
@@ -47,7 +47,8 @@ __global__ void __launch_bounds__(kBlockSize)
     if (basis == 0) gather_shape(in, rotations, s, row - in.offset[s], out);
 }
 
-// Replaces a host array by a copy on the device, which exists as long as this object.
+// Replaces a host array by a copy on the device, which is freed together with this
+// object.
 template <class T>
 class Copy {
   public:

@@ -24,7 +24,8 @@ struct RotationTables {
     RotationTables(const GatherInput& in, int sh_degree);
 };
 
-// Writes a gaussian without its SH coefficients. `within` is its index in cluster s.
+// Writes a gaussian without its SH coefficients. `within` is the index of the gaussian
+// in cluster s.
 V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s,
                                  int64_t within, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;

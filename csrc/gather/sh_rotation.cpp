@@ -1,7 +1,7 @@
-// Computes the matrix that rotates an SH band. A band is closed under rotation. So its
-// matrix follows from the values of the bases in enough directions: the colour in
-// direction d of the new frame is the colour of the old frame in direction d rotated
-// back.
+// Computes the matrix that rotates an SH band. A rotation maps a band to itself, so its
+// matrix follows from the values of the bases in enough directions. The colour in
+// direction d of the new frame equals the colour of the old frame in direction d,
+// rotated back.
 
 #include "gather/sh_rotation.h"
 
@@ -15,7 +15,7 @@ namespace v3dg {
 namespace {
 
 constexpr int kMaxBand = 7;
-// The number of directions. The largest band needs 7; with many more, the equations are
+// Number of directions. The largest band needs 7; many more make the equations
 // well-conditioned.
 constexpr int kNumDirections = 32;
 

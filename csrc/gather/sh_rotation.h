@@ -4,8 +4,8 @@
 
 namespace v3dg {
 
-// The doubles per rotation: square matrices of size 3, 5 and 7 for the SH bands 1, 2
-// and 3.
+// Number of doubles per rotation: square matrices of size 3, 5 and 7 for the SH bands
+// 1, 2 and 3.
 constexpr int kBandsSize = 3 * 3 + 5 * 5 + 7 * 7;
 
 // Computes the matrices that transform the SH coefficients of bands 1 to `degree` into

@@ -1,7 +1,7 @@
 #pragma once
 
-// The hash of pages, tables and files: BLAKE2b, for one message, for several at once,
-// and for pieces of a message.
+// The hash of pages, tables and files: BLAKE2b for one message, for several at once,
+// and for the pieces of a message.
 
 #include <array>
 #include <cstddef>
@@ -18,8 +18,8 @@ constexpr size_t kHashPieceBytes = 16384;
 using PageHash = std::array<uint8_t, kPageHashBytes>;
 
 // Computes the hashes of several messages: BLAKE2b (RFC 7693) with digests of 16 bytes
-// and no key. On processors with wide vectors, each message is a lane of a vector. So
-// eight messages of similar length are fastest.
+// and no key. On processors with wide vectors, each message is in one lane of a vector.
+// Eight messages of similar length are hashed most efficiently.
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
 // Computes the hash of one message, which is added in parts.
@@ -27,19 +27,20 @@ class Blake2b {
   public:
     Blake2b();
     void add(const unsigned char* bytes, size_t size);
-    // Returns the hash of all bytes that were added. No more bytes may be added.
+    // Returns the hash of all bytes that were added. After this call, no more bytes may
+    // be added.
     PageHash digest();
 
   private:
     uint64_t state_[8];
-    uint64_t num_bytes_ = 0;  // hashed bytes, without the bytes that wait in the buffer
+    uint64_t num_bytes_ = 0;  // number of hashed bytes, without those in the buffer
     unsigned char waiting_[kHashBlockBytes] = {};
     size_t num_waiting_ = 0;
 };
 
 // Computes the hash of the digests of a message's pieces. A piece has kHashPieceBytes;
-// the last one may be shorter. Pieces are hashed in parallel lanes, so this is several
-// times as fast as Blake2b.
+// the last one may be shorter. This is several times as fast as Blake2b, because pieces
+// are hashed in parallel lanes.
 class HashOfPieces {
   public:
     explicit HashOfPieces(Span<const uint8_t> message) : message_(message) {}

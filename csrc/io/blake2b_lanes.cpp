@@ -1,4 +1,4 @@
-// BLAKE2b for 64-bit words or for vectors of words. The lanes of a vector are either
+// BLAKE2b for 64-bit words or for vectors of words. The lanes of a vector hold either
 // the words of several messages, or a row of the state of one message.
 
 #include "io/blake2b_lanes.h"
@@ -73,7 +73,7 @@ using Words = Row;
 using Words = uint64_t;
 #endif
 
-// b is added last, because b is computed last
+// b is added last, because it is computed last
 template <class V>
 V3DG_INLINE void mix(V& a, V& b, V& c, V& d, V x, V y) {
     a = a + x + b;
@@ -107,7 +107,7 @@ V3DG_INLINE void mix_rounds(V* v, const V* m, std::index_sequence<kRounds...>) {
 }
 
 // Adds one block. `end` is the number of bytes up to the end of this block. `last` has
-// all bits set for the last block, otherwise none.
+// all bits set for the last block, and none for others.
 template <class V>
 V3DG_INLINE void compress(V* h, const V* m, V end, V last) {
     V v[16];
@@ -193,8 +193,8 @@ void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* bl
     compress_one(state, block, num_bytes, ~uint64_t{0});
 }
 
-// Returns the digest of a message. The first `num_bytes` bytes were added to the state
-// before; `rest` has the remaining bytes.
+// Returns the digest of a message. `state` includes the first `num_bytes` bytes, and
+// `rest` has the remaining ones.
 static PageHash digest_of_rest(uint64_t* state, uint64_t num_bytes, const unsigned char* rest,
                                size_t size) {
     const size_t whole = size > 0 ? (size - 1) / kHashBlockBytes : 0,
@@ -223,8 +223,8 @@ V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
         __m512i rows[8];
         for (int i = 0; i < 8; ++i) rows[i] = _mm512_loadu_si512(blocks[i] + 64 * half);
         for (int odd = 0; odd < 2; ++odd) {
-            __m512i pairs[4];  // per lane: words odd, odd + 2, odd + 4, odd + 6
-            __m512i fours[4];  // per lane: two of the words in `pairs`
+            __m512i pairs[4];  // in each lane: words odd, odd + 2, odd + 4, odd + 6
+            __m512i fours[4];  // in each lane: two of the words in `pairs`
             for (int i = 0; i < 4; ++i)
                 pairs[i] = odd ? _mm512_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm512_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
@@ -252,7 +252,7 @@ V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
         for (int i = 0; i < 4; ++i)
             rows[i] = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(blocks[i] + 32 * part));
         for (int odd = 0; odd < 2; ++odd) {
-            __m256i pairs[2];  // per lane: words odd and odd + 2
+            __m256i pairs[2];  // in each lane: words odd and odd + 2
             for (int i = 0; i < 2; ++i)
                 pairs[i] = odd ? _mm256_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm256_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
@@ -275,8 +275,8 @@ class Lanes {
         end_[lane] = 0;
         for (int i = 0; i < 8; ++i) state_[i][lane] = kHashStart[i];
     }
-    // Adds blocks to all messages until one of them ends, and stores the digests of
-    // messages that ended.
+    // Adds blocks to all messages until one of them ends. Stores the digests of
+    // messages that have ended.
     void advance() {
         size_t whole = SIZE_MAX;
         for (size_t k = 0; k < kNumLanes; ++k)

@@ -1,7 +1,7 @@
 #pragma once
 
-// The compression function of BLAKE2b for each instruction set: for one message, and
-// for several messages in parallel.
+// The compression function of BLAKE2b for each instruction set, both for one message
+// and for several messages in parallel.
 
 #include <cstddef>
 #include <cstdint>
@@ -26,11 +26,12 @@ constexpr uint64_t kHashStart[8] = {kHashConstant[0] ^ 0x01010000 ^ kPageHashByt
                                     kHashConstant[7]};
 
 V3DG_DECLARE_PER_ISA(
-    // Adds whole blocks to the state. None of them may be the last block of the
-    // message. `num_bytes` bytes must have been added before.
+    // Adds whole blocks to the state. The last block of the message must not be among
+    // them. `num_bytes` is the number of bytes that were added before.
     void add_blocks(uint64_t* state, uint64_t num_bytes, const unsigned char* blocks,
                     size_t num_blocks);
-    // Adds the last block, padded with zeros. `num_bytes` is the size of the message.
+    // Adds the last block, padded with zeros. `num_bytes` is the size of the whole
+    // message.
     void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* block);
     void hash_messages(Span<const Span<const uint8_t>> messages, PageHash* digests);)
 

@@ -1,6 +1,7 @@
 #pragma once
 
-// Files by descriptor, as the system has them: `File` reads and writes at offsets.
+// Files by descriptor. `File` is the class of the operating system; it reads and writes
+// at offsets.
 
 #if defined(_WIN32)
 #include "io/windows_file.h"

@@ -8,8 +8,10 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kPieceBytes = size_t(1) << 20;
-constexpr size_t kPiecesAhead = 8;  // pieces that are requested from the disk together
-// The usual size of the coarsest page, which precedes the tables and is needed next.
+constexpr size_t kPiecesAhead = 8;  // number of pieces that are requested from the disk
+                                    // together
+// The usual size of the coarsest page, which comes before the tables in the file and is
+// needed next.
 constexpr size_t kNeededBefore = size_t(64) << 10;
 
 }  // namespace
@@ -60,8 +62,8 @@ void HashedRead::report(size_t num_read, bool is_over) {
     has_more_.notify_one();
 }
 
-// Waits until more than `num_known` bytes are read, or reading has ended. Returns the
-// number of bytes that were read.
+// Waits until more than `num_known` bytes have been read, or reading has ended. Returns
+// the number of bytes that have been read.
 size_t HashedRead::wait_for_more(size_t num_known) {
     const MutexLock lock(busy_);
     while (!is_over_ && num_read_ <= num_known) has_more_.wait(busy_);
@@ -80,7 +82,7 @@ bool HashedRead::hash() {
         end = num_before + std::min(wait_for_more(done - num_before), message_.size - num_before);
         if (end == done) break;  // the file ended early, which wait() reports
     }
-    // Wait for the hash at the end of the message, with which the digest is compared.
+    // The digest is compared with the hash at the end of the message, so wait for it.
     wait_for_more(bytes_.size - 1);
     const PageHash digest = hash_of_ == HashOf::bytes ? of_bytes.digest() : of_pieces.digest();
     return std::equal(digest.begin(), digest.end(), message_.end());

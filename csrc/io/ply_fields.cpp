@@ -1,6 +1,6 @@
 // Finds the properties of a vertex that make a gaussian, in files of the 3DGS code and
-// of other trainers. If properties are missing, the error says what kind of file it
-// probably is.
+// of other trainers. If properties are missing, the error text says what kind of file
+// it probably is.
 
 #include "io/ply_fields.h"
 
@@ -13,13 +13,13 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kMaxNames = 8;  // most property names in an error text
+constexpr size_t kMaxNames = 8;  // maximum number of property names in an error text
 
-// Prefixes of property names other than positions, normals and colours: those of
-// CloudCompare, of 3dgsconverter, and of both.
+// Prefixes of property names, except for positions, normals and colours. They are those
+// of CloudCompare, of 3dgsconverter, and of both.
 constexpr const char* kPrefixes[] = {"scalar_", "scal_", "scalar_scal_"};
 
-// Returns the prefix of the property names of gaussians; empty for the names that
+// Returns the prefix of the property names of gaussians. It is empty for files that
 // trainers write.
 std::string prefix_of(const PlyElement& vertex) {
     std::unordered_set<std::string> names;
@@ -30,8 +30,8 @@ std::string prefix_of(const PlyElement& vertex) {
     return "";
 }
 
-// Returns the element with the property names that trainers write. A name is kept if
-// another property has it without the prefix.
+// Returns the element with the property names that trainers use. If another property
+// already has the name without the prefix, the prefix is kept.
 PlyElement without_prefix(PlyElement vertex, const std::string& prefix) {
     if (prefix.empty()) return vertex;
     std::unordered_set<std::string> names;
@@ -59,7 +59,7 @@ Fields fields_of(const PlyElement& vertex) {
         const PlyProperty& property = vertex.properties[p];
         const std::string& name = property.name;
         if (fields.has(name) || fields.lists.count(name))
-            throw PlyError("expected each vertex property once, got " + quoted(name) + " twice");
+            throw PlyError("expected each vertex property once, got " + in_quotes(name) + " twice");
         if (property.is_list) {
             fields.lists.insert(name);
         } else {
@@ -81,7 +81,7 @@ size_t num_stored_sh(const PlyElement& vertex) {
                    std::to_string(num_rest));
 }
 
-// Returns the names of the properties with base colours. The result is empty if the
+// Returns the names of the properties that have base colours. There are none if the
 // file has SH coefficients, or no colours at all.
 std::vector<std::string> base_color_names(const Fields& fields) {
     if (fields.has("f_dc_0")) return {};
@@ -99,13 +99,13 @@ double color_scale(const std::string& name, PlyType type) {
         case PlyType::float32:
         case PlyType::float64: return 1;
         default:
-            throw PlyError("expected a colour " + quoted(name) +
+            throw PlyError("expected a colour " + in_quotes(name) +
                            " of the type uchar, ushort or float, got another type");
     }
 }
 
-// Returns the name of the property of each slot. The name is empty for a slot that the
-// file does not have.
+// Returns the name of the property of each slot. It is empty if the file does not have
+// the slot.
 std::vector<std::string> slot_names(const Fields& fields, size_t num_stored, PlyLayout& layout) {
     std::vector<std::string> names = {"x",     "y",       "z",       "rot_0",   "rot_1",  "rot_2",
                                       "rot_3", "scale_0", "scale_1", "scale_2", "opacity"};
@@ -125,8 +125,8 @@ std::vector<std::string> slot_names(const Fields& fields, size_t num_stored, Ply
     return names;
 }
 
-// Returns advice for a file without the required properties: what kind of file it is,
-// and what to do.
+// Returns what to say about a file without the required properties: what kind of file
+// it is, and what to do.
 std::string advice(const Fields& fields, size_t num_missing) {
     if (fields.has("f_anchor_feat_0"))
         return "; this file has the anchors of Scaffold-GS, of which a network makes gaussians: "
@@ -148,7 +148,7 @@ std::string missing_text(const PlyElement& vertex, const Fields& fields,
         text += " and " + std::to_string(missing.size() - kMaxNames) + " more";
     text += ", got ";
     for (size_t i = 0; i < vertex.properties.size() && i < kMaxNames; ++i)
-        text += (i == 0 ? "" : ", ") + quoted(vertex.properties[i].name);
+        text += (i == 0 ? "" : ", ") + in_quotes(vertex.properties[i].name);
     if (vertex.properties.empty()) text += "none";
     if (vertex.properties.size() > kMaxNames)
         text += " and " + std::to_string(vertex.properties.size() - kMaxNames) + " more";
@@ -170,7 +170,8 @@ PlyLayout layout_of(const PlyElement& stored) {
     std::vector<std::string> missing;
     for (const std::string& name : slot_names(fields, num_stored, layout)) {
         if (fields.lists.count(name))
-            throw PlyError("expected a number as vertex property " + quoted(name) + ", got a list");
+            throw PlyError("expected a number as vertex property " + in_quotes(name) +
+                           ", got a list");
         const auto field = fields.field_from_name.find(name);
         if (field != fields.field_from_name.end())
             layout.fields.push_back(field->second);

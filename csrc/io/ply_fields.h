@@ -12,27 +12,29 @@
 
 namespace v3dg {
 
-// The bytes that all threads convert together, if one thread has to separate the rows.
+// Number of bytes that all threads convert together, if a single thread must separate
+// the rows.
 constexpr size_t kPlyChunkBytes = size_t(1) << 22;
 
-// The slots of a gaussian: where its numbers begin. From kSh on, slots have the order
-// of memory.
+// The slots of a gaussian, which give the index of its first mean, quaternion element,
+// and so on. From kSh on, slots are in the order of memory.
 enum PlySlot : size_t { kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kFilter = 11, kSh = 12 };
 
 // Returns the layout of a vertex. Throws PlyError if a property is missing, occurs
 // twice, or is a list.
 PlyLayout layout_of(const PlyElement& stored);
 
-// The limits of numbers whose squares a double represents with full precision.
+// Limits of the numbers whose squares a double represents with full precision.
 constexpr double kLeastSquared = 1e-140;
 constexpr double kMostSquared = 1e140;
 
-// The tolerance of squared lengths. Rounding a unit quaternion to float32 changes its
+// The tolerance for squared lengths. Rounding a unit quaternion to float32 changes its
 // squared length by up to 3e-7.
 constexpr double kUnitTolerance = 1e-6;
 
-// Multiplies a quaternion by a power of two if its squares exceed the range of doubles.
-// Quaternions that are zero or not finite stay unchanged.
+// If the squares of a quaternion's elements are out of the range of doubles, multiplies
+// the quaternion by a power of two. A quaternion that is zero or not finite is not
+// changed.
 inline void scale_extreme(double quat[4]) {
     double largest = 0;
     for (size_t j = 0; j < 4; ++j) largest = std::max(largest, std::abs(quat[j]));
@@ -43,8 +45,8 @@ inline void scale_extreme(double quat[4]) {
 }
 
 // Widens a gaussian along each axis by a filter of this standard deviation, and reduces
-// its opacity, so that it covers as much as before. Source: Yu et al., Mip-Splatting,
-// CVPR 2024, equation 9.
+// its opacity, so that its total contribution stays the same. Source: Yu et al.,
+// Mip-Splatting, CVPR 2024, equation 9.
 inline void widen(double filter, size_t num_axes, double scales[3], double& opacity) {
     for (size_t j = 0; j < num_axes; ++j) {
         const double widened = std::hypot(scales[j], filter);

@@ -1,5 +1,5 @@
-// Parses the header of a .ply file. Callers compare the sizes in it with the size of
-// the file.
+// Parses the header of a .ply file. Callers must compare the sizes in it with the size
+// of the file.
 
 #include "io/ply_header.h"
 
@@ -10,10 +10,10 @@ namespace v3dg {
 
 namespace {
 
-// Real headers have a few kilobytes.
+// Maximum size of a header. Real headers have a few kilobytes.
 constexpr size_t kMaxHeaderBytes = size_t(1) << 20;
-// The largest number of elements. Real files have one or two. Elements before the
-// vertices must be skipped one after another.
+// Maximum number of elements. Real files have one or two. There is a limit because
+// elements before the vertices must be skipped one after another.
 constexpr size_t kMaxElements = 64;
 
 constexpr const char* kSpace = " \t\r\v\f";
@@ -50,19 +50,19 @@ PlyType parse_type(const std::string& name) {
     };
     for (const auto& [text, type] : kTypes)
         if (name == text) return type;
-    throw PlyError("expected a scalar type such as float, got " + quoted(name));
+    throw PlyError("expected a scalar type such as float, got " + in_quotes(name));
 }
 
 PlyEncoding parse_format(const std::vector<std::string>& words) {
     if (words.size() != 3 || words[2] != "1.0")
         throw PlyError("expected a format and the version 1.0, got " +
                        std::to_string(words.size() - 1) + " words" +
-                       (words.size() > 2 ? " and version " + quoted(words[2]) : ""));
+                       (words.size() > 2 ? " and version " + in_quotes(words[2]) : ""));
     if (words[1] == "ascii") return PlyEncoding::ascii;
     if (words[1] == "binary_little_endian") return PlyEncoding::binary_little_endian;
     if (words[1] == "binary_big_endian") return PlyEncoding::binary_big_endian;
     throw PlyError("expected format ascii, binary_little_endian or binary_big_endian, got " +
-                   quoted(words[1]));
+                   in_quotes(words[1]));
 }
 
 PlyElement parse_element(const std::vector<std::string>& words) {
@@ -74,8 +74,8 @@ PlyElement parse_element(const std::vector<std::string>& words) {
     const char* end = words[2].data() + words[2].size();
     const auto [stop, error] = std::from_chars(words[2].data(), end, element.count);
     if (error != std::errc() || stop != end)
-        throw PlyError("expected a count of element " + quoted(words[1]) + ", got " +
-                       quoted(words[2]));
+        throw PlyError("expected a count of element " + in_quotes(words[1]) + ", got " +
+                       in_quotes(words[2]));
     return element;
 }
 
@@ -92,12 +92,12 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
         property.count_type = parse_type(words[2]);
         if (property.count_type >= PlyType::float32)
             throw PlyError("expected an integer type for the length of a list, got " +
-                           quoted(words[2]));
+                           in_quotes(words[2]));
     }
     return property;
 }
 
-// Parses the lines of one header, one after another.
+// Parses the lines of a header, one after another.
 struct HeaderParser {
     PlyHeader header;
     bool has_format = false;
@@ -128,7 +128,7 @@ struct HeaderParser {
             return true;
         } else {
             throw PlyError("expected format, element, property or end_header, got " +
-                           quoted(words[0]));
+                           in_quotes(words[0]));
         }
         return false;
     }
@@ -148,7 +148,7 @@ size_t PlyElement::min_row_bytes() const {
     return bytes;
 }
 
-std::string quoted(const std::string& text) {
+std::string in_quotes(const std::string& text) {
     constexpr size_t kMaxLength = 40;
     std::string shown = text.substr(0, kMaxLength);
     for (char& c : shown)
@@ -183,7 +183,7 @@ PlyHeader read_ply_header(const File& file) {
         if (!line.empty() && line.back() == '\r') line.pop_back();
         if (line_number == 1 && line != "ply")
             throw PlyError("expected a first line 'ply', got " +
-                           (text.empty() ? "an empty file" : quoted(line)));
+                           (text.empty() ? "an empty file" : in_quotes(line)));
         try {
             if (line_number > 1 && !is_cut && parser.take(line)) {
                 parser.header.size = std::min(line_end + 1, text.size());

@@ -12,16 +12,16 @@
 
 namespace v3dg {
 
-// The error for wrong content of a file. The text is one line of printable ASCII that
-// states what was expected and what was found. It does not name the file.
+// The error for invalid content of a file. The text is one line of printable ASCII that
+// states what was expected and what was found. It does not contain the file name.
 struct PlyError : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
 
 enum class PlyEncoding { ascii, binary_little_endian, binary_big_endian };
 
-// The scalar types of the format, integers first. The last types are not in the format,
-// but some programs write them.
+// The scalar types of the format, integers first. The last types do not belong to the
+// format, but some programs write them.
 enum class PlyType {
     int8,
     uint8,
@@ -43,10 +43,10 @@ inline size_t size_of(PlyType type) {
 
 struct PlyProperty {
     std::string name;
-    // Type of the number, or of the elements of the list.
+    // Type of the number or, for a list, of its elements.
     PlyType type = PlyType::float32;
     bool is_list = false;
-    // Type of the length of a list; an integer type.
+    // Integer type of the length of a list.
     PlyType count_type = PlyType::uint8;
 };
 
@@ -56,7 +56,7 @@ struct PlyElement {
     std::vector<PlyProperty> properties;
 
     bool has_lists() const;
-    // Returns the bytes of a binary row in which all lists are empty.
+    // Returns the number of bytes of a binary row in which all lists are empty.
     size_t min_row_bytes() const;
 };
 
@@ -64,18 +64,18 @@ struct PlyHeader {
     PlyEncoding encoding = PlyEncoding::ascii;
     std::vector<PlyElement> elements;
     std::vector<std::string> comments;  // without the keyword and surrounding spaces
-    size_t size = 0;                    // bytes, including the line end_header
+    size_t size = 0;                    // in bytes, including the line end_header
 };
 
 // Opens a file. Throws std::system_error if it cannot be opened, and PlyError if it is
 // not a regular file.
 File open_ply_file(const char* path);
 
-// Reads and checks the header. Does not compare it with the size of the file. Throws
-// PlyError.
+// Reads and checks the header, but does not compare it with the size of the file.
+// Throws PlyError.
 PlyHeader read_ply_header(const File& file);
 
-// Returns `text` in quotes, shortened and printable, for an error text.
-std::string quoted(const std::string& text);
+// Returns `text` in quotation marks, shortened and printable, for an error text.
+std::string in_quotes(const std::string& text);
 
 }  // namespace v3dg

@@ -1,5 +1,5 @@
-// Opens .ply files, and chooses how their rows are read. ply_fields.h defines the
-// meaning of a row, ply_rows.h reads binary rows, ply_text.h reads lines of text.
+// Opens .ply files, and chooses how to read their rows. ply_fields.h defines the
+// meaning of a row, ply_rows.h reads binary rows, and ply_text.h reads lines of text.
 
 #include "io/ply.h"
 
@@ -19,14 +19,14 @@ namespace {
 // Throws PlyError if the file is too short for all rows of the element.
 void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     const bool is_text = ply.encoding == PlyEncoding::ascii;
-    // A number and its separator have at least two characters. After the last number,
-    // the separator may be missing.
+    // A number and its separator have at least two characters. The separator may be
+    // missing after the last number of the file.
     const size_t row_bytes = is_text ? 2 * element.properties.size() : element.min_row_bytes();
     // `offset` can exceed file_bytes if the file has grown since it was opened.
     const size_t left = ply.file_bytes - std::min(offset, ply.file_bytes);
     if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
-                       quoted(element.name) + " with " +
+                       in_quotes(element.name) + " with " +
                        (is_text || element.has_lists() ? "at least " : "") +
                        std::to_string(row_bytes) + " bytes each, got " + std::to_string(left) +
                        " bytes; the file is truncated");

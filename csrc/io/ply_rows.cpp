@@ -1,5 +1,5 @@
 // Reads binary rows. RowDecoder converts rows of fixed size. ByteReader reads rows with
-// lists, which are packed to rows of fixed size.
+// lists, which are then packed to rows of fixed size.
 
 #include "io/ply_rows.h"
 
@@ -19,10 +19,10 @@ namespace v3dg {
 
 namespace {
 
-// The bytes that a thread reads and converts at once. They fit into the cache of a
-// core.
+// Number of bytes that a thread reads and converts at once. They fit into the cache of
+// a core.
 constexpr size_t kBlockBytes = size_t(1) << 18;
-// The rows that a thread converts at once, if one thread reads the rows of a file.
+// Number of rows that a thread converts at once, if a single thread reads the file.
 constexpr size_t kRowsPerTask = 256;
 
 template <class T>
@@ -34,7 +34,7 @@ T load_as(const char* bytes, bool is_swapped) {
     return value;
 }
 
-// Converts an IEEE 754 half.
+// Converts an IEEE 754 half float.
 double from_half(uint16_t bits) {
     const int exponent = bits >> 10 & 31;
     const int fraction = bits & 1023;
@@ -69,8 +69,8 @@ bool is_swapped(PlyEncoding encoding) {
     return (encoding == PlyEncoding::binary_big_endian) == (first == 1);
 }
 
-// Converts rows of binary numbers to gaussians. The rows have no lists, and thus equal
-// size.
+// Converts rows of binary numbers to gaussians. The rows have no lists, so all have the
+// same size.
 class RowDecoder {
   public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)
@@ -125,7 +125,7 @@ class ByteReader {
     void skip(size_t size, const PlyElement& element, uint64_t row) {
         if (size > file_bytes_ - std::min(offset_, file_bytes_))
             throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
-                           quoted(element.name) + ", got the end of the file in row " +
+                           in_quotes(element.name) + ", got the end of the file in row " +
                            std::to_string(row));
         offset_ += size;
     }
@@ -152,8 +152,8 @@ class ByteReader {
     size_t buffer_size_ = 0;
 };
 
-// Parses one row. Unless `packed` is null, the numbers that are not in lists are copied
-// to `packed`.
+// Parses one row. If `packed` is not null, copies the numbers that are not in lists to
+// it.
 void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool is_swapped,
               char* packed) {
     for (const PlyProperty& property : element.properties) {
@@ -163,8 +163,8 @@ void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool 
                                              property.count_type, is_swapped);
             if (count < 0)
                 throw PlyError("expected a whole number as length of list " +
-                               quoted(property.name) + " in row " + std::to_string(row) + ", got " +
-                               std::to_string(static_cast<int64_t>(count)));
+                               in_quotes(property.name) + " in row " + std::to_string(row) +
+                               ", got " + std::to_string(static_cast<int64_t>(count)));
             reader.skip(static_cast<size_t>(count) * size_of(property.type), element, row);
         } else if (packed != nullptr) {
             const size_t size = size_of(property.type);
@@ -185,8 +185,8 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<
     const size_t num_rows = out.opacities.size;
     const size_t num_blocks = (num_rows + block_rows - 1) / block_rows;
     const int num_threads = static_cast<int>(std::min<size_t>(most_threads(), num_blocks));
-    // new char[] does not initialise the memory, so that a thread without a block
-    // touches none.
+    // new char[] does not initialise the memory, so the memory of threads that read no
+    // block is never touched.
     const std::unique_ptr<char[]> buffers(new char[num_threads * block_rows * row_bytes]);
     parallel_for_on(num_threads, num_blocks, 1, [&](size_t block) {
         char* rows = buffers.get() + thread_index() * block_rows * row_bytes;

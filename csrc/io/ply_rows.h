@@ -1,8 +1,8 @@
 #pragma once
 
 // Reads the binary rows of a .ply file. Rows of fixed size are read and converted by
-// all threads, each in separate blocks. Rows with lists are separated by one thread,
-// and converted by all threads.
+// all threads, each of which reads its own blocks. Rows with lists are separated by one
+// thread, and converted by all threads.
 
 #include <cstddef>
 
@@ -10,8 +10,8 @@
 
 namespace v3dg {
 
-// Read gaussians from `begin` on, as many as `out` has room for. Return the place of
-// the next gaussian. Throw PlyError and std::system_error.
+// Read as many gaussians as `out` has room for, beginning at `begin`. Return the place
+// of the next gaussian. Throw PlyError and std::system_error.
 PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 PlyPlace read_rows_with_lists(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 

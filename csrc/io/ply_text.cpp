@@ -1,4 +1,4 @@
-// Reads .ply text. LineReader separates lines, NumberReader reads the numbers of a
+// Reads .ply text. LineReader separates lines, and NumberReader reads the numbers of a
 // line.
 
 #include "io/ply_text.h"
@@ -28,8 +28,8 @@ bool is_space(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\v' |
 // Reads the lines of a text file, except blank lines.
 class LineReader {
   public:
-    // The buffer has room for one byte more than the rest of the file, so that reading
-    // detects the end of the file.
+    // The buffer has room for one byte more than the rest of the file. This byte makes
+    // the end of the file detectable.
     LineReader(const File& file, size_t offset, size_t file_bytes)
         : file_(file),
           offset_(offset),
@@ -37,8 +37,8 @@ class LineReader {
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
-    // Returns some of the next lines: at least one and at most `max_lines`, or none at
-    // the end of the file. They are valid until the next call.
+    // Returns some of the next lines: at most `max_lines`, and at least one unless the
+    // file has ended. They are valid until the next call.
     const std::vector<Line>& next(uint64_t max_lines) {
         lines_.clear();
         bool at_end = false;
@@ -102,7 +102,7 @@ class NumberReader {
         const auto [stop, error] = std::from_chars(first, rest_.begin, value);
         if (error != std::errc() || stop != rest_.begin)
             throw PlyError("vertex " + std::to_string(row_) + ": expected a number, got " +
-                           quoted(std::string(word, rest_.begin)));
+                           in_quotes(std::string(word, rest_.begin)));
         ++num_read_;
         return value;
     }
@@ -110,8 +110,8 @@ class NumberReader {
         const double count = next();
         if (!(count >= 0) || count != std::floor(count))
             throw PlyError("vertex " + std::to_string(row_) +
-                           ": expected a whole number as length of list " + quoted(property.name) +
-                           ", got " + std::to_string(count));
+                           ": expected a whole number as length of list " +
+                           in_quotes(property.name) + ", got " + std::to_string(count));
         for (double i = 0; i < count; ++i) next();
     }
     void expect_end() {
@@ -131,7 +131,7 @@ class NumberReader {
 };
 
 // Rounds a number to its type. A float is written as the shortest text that identifies
-// it among floats; read as a double, this text is a slightly different number.
+// it among floats. Read as a double, this text gives a slightly different number.
 double rounded_to(PlyType type, double value) {
     return type == PlyType::float32 ? static_cast<double>(static_cast<float>(value)) : value;
 }
@@ -156,7 +156,7 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
 
 [[noreturn]] void throw_too_few(const PlyElement& element, uint64_t num_lines) {
     throw PlyError("expected " + std::to_string(element.count) + " lines for element " +
-                   quoted(element.name) + ", got " + std::to_string(num_lines));
+                   in_quotes(element.name) + ", got " + std::to_string(num_lines));
 }
 
 }  // namespace

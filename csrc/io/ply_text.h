@@ -1,6 +1,6 @@
 #pragma once
 
-// Reads the rows of a .ply text file. One thread separates the lines, all threads
+// Reads the rows of a .ply text file. One thread separates the lines, and all threads
 // convert their numbers.
 
 #include <cstddef>
@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// Reads gaussians from `begin` on, as many as `out` has room for. Returns the place of
-// the next gaussian. Throws PlyError and std::system_error.
+// Reads as many gaussians as `out` has room for, beginning at `begin`. Returns the
+// place of the next gaussian. Throws PlyError and std::system_error.
 PlyPlace read_text(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 
 // Returns the offset of the end of the element that begins at `offset`. Throws PlyError

@@ -1,5 +1,5 @@
 // Writes .ply files. All threads convert blocks of rows. The offsets of binary blocks
-// are known, so each thread writes its blocks. Text is converted a few blocks at a
+// are known, so each thread also writes its blocks. Text is converted a few blocks at a
 // time, and written in order.
 
 #include <algorithm>
@@ -20,11 +20,12 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kBlockRows = 2048;  // half a megabyte at SH degree 3
-constexpr size_t kTextBlocks = 16;   // blocks in memory at once
+constexpr size_t kTextBlocks = 16;   // number of blocks in memory at once
 
-// Finite replacements for infinite logarithms and logits. They exceed the logarithms
-// and logits of all other float32 values, which are at least -103.3 and at most 16.6.
-// exp() and the sigmoid of them round to exactly 0 and 1, even in float32.
+// Finite replacements for infinite logarithms and logits. They are beyond the
+// logarithms and logits of all other float32 values, which are at least -103.3 and at
+// most 16.6. Their exp() and sigmoid are exactly 0 and 1 after rounding, even in
+// float32.
 constexpr float kLogOfZero = -110;
 constexpr float kLogitOfOne = 20;
 
@@ -93,7 +94,8 @@ void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsign
 }
 
 void append_text(const float* values, size_t count, std::string& text) {
-    // The shortest text that is read as the same float has at most 15 characters.
+    // Maximum length of a number. The shortest text that is read as the same float has
+    // at most 15 characters.
     constexpr size_t kMaxDigits = 32;
     char word[kMaxDigits];
     for (size_t v = 0; v < count; ++v) {

@@ -20,8 +20,8 @@ namespace v3dg {
 class PosixFile {
   public:
     static PosixFile open(const char* path) {
-        // O_NONBLOCK: opening a pipe does not wait for a writer. Regular files ignore
-        // this flag.
+        // With O_NONBLOCK, opening a pipe does not wait for a writer. For regular
+        // files, the flag has no effect.
         return PosixFile(::open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK));
     }
     static PosixFile create(const char* path) {
@@ -43,15 +43,15 @@ class PosixFile {
     bool is_folder() const { return S_ISDIR(status().st_mode); }
     bool is_regular() const { return S_ISREG(status().st_mode); }
 
-    // Returns the number of bytes that were read: less than `size` only at the end of
-    // the file.
+    // Returns the number of bytes that were read. It is less than `size` only at the
+    // end of the file.
     size_t read_at(size_t offset, char* bytes, size_t size) const {
         iovec piece{bytes, size};
         return read_at(offset, Span<iovec>{&piece, 1});
     }
 
     // Reads into at most 1024 pieces of memory, one after another. Modifies `pieces`.
-    // Returns the number of bytes that were read, like read_at() above.
+    // Returns the number of bytes that were read, as above.
     size_t read_at(size_t offset, Span<iovec> pieces) const {
         size_t done = 0;
         while (!pieces.empty()) {
@@ -91,7 +91,7 @@ class PosixFile {
         }
     }
 
-    // Closes the file. Some file systems report a failed write only now.
+    // Closes the file. Some file systems only report a failed write now.
     void close() {
         const int descriptor = descriptor_;
         descriptor_ = -1;

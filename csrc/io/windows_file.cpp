@@ -1,5 +1,5 @@
-// Offsets are given to each read and write (OVERLAPPED), so that several threads can
-// share a file. The position of the handle is not used.
+// The position of the handle is not used: an offset is passed to each read and write
+// (OVERLAPPED), so that several threads can share a file.
 
 #if defined(_WIN32)
 
@@ -18,7 +18,7 @@ namespace v3dg {
 namespace {
 
 constexpr DWORD kShareAll = FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE;
-// The largest number of bytes of one system call.
+// Maximum number of bytes of one system call.
 constexpr size_t kMostBytes = size_t(1) << 30;
 
 int errno_of(DWORD error) {
@@ -69,7 +69,8 @@ WindowsFile::WindowsFile(void* handle) : handle_(handle) {
 }
 
 WindowsFile WindowsFile::open(const char* path) {
-    // FILE_FLAG_BACKUP_SEMANTICS: folders can be opened, and are refused by name.
+    // With FILE_FLAG_BACKUP_SEMANTICS, a folder can be opened, and is then rejected
+    // with an error text that names it.
     return WindowsFile(CreateFileW(wide(path).c_str(), GENERIC_READ, kShareAll, nullptr,
                                    OPEN_EXISTING, FILE_FLAG_BACKUP_SEMANTICS, nullptr));
 }

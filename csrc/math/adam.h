@@ -1,7 +1,7 @@
 #pragma once
 
-// A step of Adam (Kingma and Ba 2015, algorithm 1), for one parameter or a vector of
-// them.
+// A step of Adam (Kingma and Ba 2015, algorithm 1), for one parameter or for a vector
+// of parameters.
 
 #include "math/lanes.h"
 

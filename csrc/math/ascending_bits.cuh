@@ -1,14 +1,14 @@
 #pragma once
 
-// Conversions between floats and integers of the same order, for sorting and selecting.
+// Convert floats to integers of the same order, and back, for sorting and selecting.
 
 #include <cstdint>
 
 namespace v3dg {
 namespace cuda {
 
-// Converts a finite float to an unsigned integer, such that integers compare like the
-// floats. -0 and 0 give the same integer.
+// Converts a finite float to an unsigned integer, such that integers have the same
+// order as the floats. -0 and 0 give the same integer.
 __device__ inline uint32_t ascending_bits(float value) {
     const uint32_t bits = __float_as_uint(value + 0.0f);
     return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);

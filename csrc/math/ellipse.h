@@ -1,7 +1,7 @@
 #pragma once
 
-// The ellipse of a gaussian on the image, and its extent in rows of pixels.
-// rasterize/rasterize_math.h has the falloff at a pixel.
+// The ellipse of a gaussian on the image, and its extent in rows of pixels. The falloff
+// at a pixel is in rasterize/rasterize_math.h.
 
 #include "math/gaussian.h"
 
@@ -17,8 +17,8 @@ struct Ellipse {
     V depth;
 };
 
-// A box of pixels: first and last column, first and last row. The box is empty if the
-// first column or row is after the last.
+// A box of pixels, given by its first and last column and row. It is empty if the first
+// column or row is after the last.
 template <class I>
 struct PixelBox {
     I x0, x1, y0, y1;
@@ -26,15 +26,16 @@ struct PixelBox {
     V3DG_HD V3DG_INLINE auto holds_pixels() const { return (x0 <= x1) & (y0 <= y1); }
 };
 
-// The ellipse |L d|² = reach, in a form for computing its extent in a row of pixels.
+// The ellipse |L d|² = reach, in a form from which its extent in a row of pixels can be
+// computed.
 template <class V>
 struct EllipseRows {
     V reach;
     V inverse;  // 1 / l11
-    V slope;    // dx / dy of the line through the centres of the rows' extents
+    V slope;    // slope dx / dy of the line through the middles of the rows' extents
     V l22;
     // The y of the rightmost point of the ellipse, relative to its centre. The leftmost
-    // point has the opposite y.
+    // point is opposite, at minus this y.
     V rightmost;
 };
 
@@ -52,11 +53,11 @@ V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opac
 
 // Computes the extent x0 to x1 of the ellipse between the rows y0 <= y1, relative to
 // its centre. A margin makes the extent slightly too large, so that only the blend step
-// decides. The result is undefined if the bounding box of the ellipse does not overlap
-// the rows.
+// decides about a pixel. The result is undefined if the bounding box of the ellipse
+// does not overlap the rows.
 //
-// Four callers derive from this extent which cells of a grid a gaussian may reach. They
-// round differently; each documents why.
+// Four callers use this extent to find the cells of a grid that a gaussian may reach.
+// They round differently, and each explains why.
 template <class V>
 V3DG_HD V3DG_INLINE void row_extent(const EllipseRows<V>& e, V y0, V y1, V& x0, V& x1) {
     const V a = min_of(max_of(e.rightmost, y0), y1), b = min_of(max_of(-e.rightmost, y0), y1);

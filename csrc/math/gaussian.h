@@ -1,7 +1,7 @@
 #pragma once
 
-// A gaussian, the memory layouts of many gaussians, and the reach of a gaussian.
-// rasterize/rasterize_math.h has its alpha at a pixel.
+// A gaussian, the memory layouts of many gaussians, and the reach of a gaussian. Its
+// alpha at a pixel is in rasterize/rasterize_math.h.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,10 +13,11 @@ namespace v3dg {
 
 constexpr double kMinAlpha = 1.0 / 255;  // smaller alphas are not blended
 constexpr double kMaxAlpha = 0.999;      // larger alphas are clamped to this value
-// gsplat's stop rule keeps the transmittance of a pixel above this value.
+// gsplat's stop rule: a pixel stops before its transmittance falls to this value.
 constexpr double kMinTransmittance = 1e-4;
 constexpr double kLog2MinAlpha = -7.994353436858858;
-// At this distance, in standard deviations, the alpha of an opaque gaussian is 1/255.
+// The distance, in standard deviations, at which the alpha of an opaque gaussian is
+// 1/255.
 constexpr double kReachSigmas = 3.33;
 constexpr double kLn2 = 0.6931471805599453;
 // sqrt(log2(e) / 2). With this scale, exp(-d² / 2) = 2^-(scale d)².
@@ -25,7 +26,7 @@ constexpr double kFalloffScale = 0.8493218002880191;
 template <class V>
 struct Gaussian3d {
     V mean[3];
-    V quat[4];   // w, x, y, z; any length but zero
+    V quat[4];   // w, x, y, z, of any nonzero length
     V scale[3];  // standard deviations
     V opacity;
 };
@@ -63,9 +64,9 @@ V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
     rows.opacities[to] = source.opacities[from];
 }
 
-// Gaussians in the layout of the CPU rasterizer: one plane per component. A plane ends
-// with kPlanePadding extra elements, so that a vector load may read beyond the last
-// gaussian.
+// Number of extra elements at the end of a plane. They allow a vector load to read
+// beyond the last gaussian. The layout of the CPU rasterizer has one plane per
+// component.
 constexpr size_t kPlanePadding = 16;
 template <class T>
 struct GaussianPlanes {
@@ -73,13 +74,14 @@ struct GaussianPlanes {
     const T* quat[4];
     const T* scale[3];
     const T* opacity;
-    const T* sh[3 * kMaxShBases];  // basis by basis, three channels each
+    const T* sh[3 * kMaxShBases];  // basis by basis, with three channels each
     int sh_degree;
 };
 
-// Colours of a bundle's clusters. They replace the colours of the clusters' gaussians.
+// Colours of a bundle's clusters, which replace the colours of their gaussians.
 struct Palette {
-    const float* sh = nullptr;           // (C, 3) SH coefficients of degree 0; null: no palette
+    const float* sh = nullptr;           // (C, 3) SH coefficients of degree 0, or null
+                                         // if there is no palette
     const int64_t* first_row = nullptr;  // first gaussian of each cluster, ascending
     uint32_t num_clusters = 0;
 
@@ -97,8 +99,9 @@ struct Palette {
     }
 };
 
-// Gaussians in the layout of CUDA frames. Four planes of (N, 4) contain a
-// PackedGaussian per row. SH coefficients are rows that begin `sh_stride` floats apart.
+// Gaussians in the layout of CUDA frames. Four planes of (N, 4) contain one
+// PackedGaussian per row. SH coefficients are stored in rows, which begin `sh_stride`
+// floats apart.
 struct PackedPlanes {
     const float* plane[4];
     const float* sh;
@@ -106,9 +109,9 @@ struct PackedPlanes {
     Palette palette;
 };
 
-// Returns an upper bound on the reach of a gaussian, in standard deviations. The bound
-// is at least the reach of extent_of(). It is negative if the gaussian is too faint to
-// be drawn, and NaN if the opacity is invalid.
+// Returns an upper bound on the reach of a gaussian, in standard deviations. It is at
+// least the reach that extent_of() computes. It is negative if the gaussian is too
+// faint to be drawn, and NaN if the opacity is invalid.
 V3DG_HD inline float reach_in_sigmas(float opacity) {
     if (opacity < float(kMinAlpha)) return -1.0f;
     const float sigmas =
@@ -116,8 +119,8 @@ V3DG_HD inline float reach_in_sigmas(float opacity) {
     return opacity <= 1 ? sigmas : NAN;
 }
 
-// Returns an upper bound on the reach of a gaussian from its mean, in model space. It
-// may be NaN if a scale is not positive.
+// Returns an upper bound on how far a gaussian reaches from its mean, in model space.
+// It may be NaN if a scale is not positive.
 V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     const float sigmas = reach_in_sigmas(g.opacity);
     if (sigmas < 0) return -1.0f;
@@ -128,7 +131,7 @@ V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
 
 // A gaussian in the form that is fastest to project, for models that are drawn
 // repeatedly. Its covariance is F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5]
-// f[7]]. The longest column of F is the first.
+// f[7]]. The first column of F is the longest.
 struct PackedGaussian {
     float mean[3];
     float reach;
@@ -153,7 +156,7 @@ V3DG_HD inline double sum_of(double a, double b) {
 #endif
 }
 
-// Returns 1 / b as input for quotient_of().
+// Returns 1 / b for use in quotient_of().
 V3DG_HD inline double inverse_of(double b) {
 #ifdef __CUDA_ARCH__
     double r;
@@ -165,9 +168,9 @@ V3DG_HD inline double inverse_of(double b) {
     return 1 / b;
 #endif
 }
-// Returns a / b; `inverse` is inverse_of(b). Precondition: the numbers are far from the
-// limits of doubles, as are all numbers that result from float32. The result equals the
-// result of a device's division, which also handles other numbers.
+// Returns a / b, where `inverse` is inverse_of(b). The result equals that of a division
+// on a device. Precondition: the numbers are far from the limits of doubles, which is
+// true for all numbers that are computed from float32.
 V3DG_HD inline double quotient_of(double a, double b, double inverse) {
 #ifdef __CUDA_ARCH__
     const double q = __dmul_rn(a, inverse);
@@ -209,7 +212,7 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
         {product_of(s, ::fma(w, y, xz)), product_of(s, ::fma(y, z, -wx)),
          ::fma(sum_of(xx, yy), -s, 1.0)},
     };
-    // Sort by scale. Indices are compile-time constants, so that the compiler can use
+    // Sort by scale. Indices are compile-time constants, so that values stay in
     // registers.
     float scale[3] = {g.scale[0], g.scale[1], g.scale[2]};
     for (int pass = 0; pass < 3; ++pass) {
@@ -227,8 +230,8 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     for (int k = 0; k < 3; ++k)
         for (int i = 0; i < 3; ++i) column[k][i] = product_of(column[k][i], scale[k]);
     // Rotate columns 1 and 2 by a Givens rotation, so that column 2 begins with 0. The
-    // rotation does not change F Fᵀ. Columns 1 and 2 are the shortest, so the rounding
-    // errors are smallest.
+    // rotation does not change F Fᵀ. Rotating the two shortest columns gives the
+    // smallest rounding errors.
     const double a0 = column[1][0], b0 = column[2][0],
                  length = sqrt_of(::fma(a0, a0, product_of(b0, b0)));
     const double inverse = inverse_of(length);

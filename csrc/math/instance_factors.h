@@ -1,13 +1,12 @@
 #pragma once
 
-// The factors by which an instance multiplies the opacities and colours of its
-// gaussians.
+// Factors that multiply the opacities and colours of an instance's gaussians.
 
 #include "math/gaussian.h"
 
 namespace v3dg {
 
-// The factors of red, green and blue, at least 0, and of the opacity, 0 to 1.
+// Factors of red, green and blue (at least 0) and of the opacity (0 to 1).
 struct InstanceFactors {
     float color[3] = {1, 1, 1};
     float opacity = 1;
@@ -19,8 +18,8 @@ V3DG_HD inline bool may_show(const InstanceFactors& factors) {
 }
 
 // Multiplies a colour from color_of_coefficients() by factors. A channel that overflows
-// becomes 0. An infinite channel would make pixels NaN in which the gaussian has weight
-// 0.
+// becomes 0. If it stayed infinite, pixels in which the gaussian has weight 0 would
+// become NaN.
 template <class V>
 V3DG_HD V3DG_INLINE void tint(const float factor[3], V color[3]) {
     using L = Lane<V>;
@@ -30,9 +29,9 @@ V3DG_HD V3DG_INLINE void tint(const float factor[3], V color[3]) {
     }
 }
 
-// Returns the SH coefficient of a colour that is multiplied by a factor. Every colour
-// is 1/2 plus a sum. The factor also multiplies the 1/2, which changes the coefficient
-// of degree 0.
+// Returns the SH coefficient of a colour that is multiplied by a factor. A colour is
+// 1/2 plus a sum. The factor also multiplies the 1/2, which changes the coefficient of
+// degree 0.
 V3DG_HD inline double tinted_coefficient(int basis, double coefficient, double factor) {
     const double tinted = factor * coefficient;
     return basis == 0 ? tinted + (factor - 1) * 0.5 / kShBase0 : tinted;

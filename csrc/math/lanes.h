@@ -1,8 +1,8 @@
 #pragma once
 
-// The elementary operations of formulas, for scalars (scalar.h) and, in sources that
-// are compiled per instruction set, for SIMD vectors (simd.h). A formula with these
-// operations and `mask ? a : b` works for both.
+// The elementary operations of formulas, for scalars (scalar.h) and for SIMD vectors
+// (simd.h). The latter only exist in sources that are compiled per instruction set. A
+// formula that uses these operations and `mask ? a : b` works for both.
 
 #include <type_traits>
 
@@ -11,7 +11,7 @@
 
 namespace v3dg {
 
-// Converts bits that are an integer below 2^24 to a floating-point number.
+// Converts an integer below 2^24, given as bits, to a floating-point number.
 template <class V>
 V3DG_HD V3DG_INLINE V float_of_number(Bits<V> bits) {
     if constexpr (std::is_arithmetic<V>::value)
@@ -30,7 +30,7 @@ V3DG_HD V3DG_INLINE bool is_any(Mask holds) {
 #endif
 }
 
-// Returns a / b. Precondition: a and b are neither tiny nor huge.
+// Returns a / b. Precondition: a and b are neither very small nor very large.
 template <class V>
 V3DG_HD V3DG_INLINE V quotient_of(V a, V b) {
 #ifdef __CUDA_ARCH__
@@ -51,15 +51,16 @@ V3DG_HD V3DG_INLINE V min_of(V a, V b) {
     return a < b ? a : b;
 }
 
-// Returns a vector with the same number in every lane. x - 0 preserves every number,
-// including -0, so the compiler removes the subtraction; x + 0 would change -0.
+// Returns a vector with the same number in every lane. The compiler removes the
+// subtraction, because x - 0 equals x for every number. It would not remove an
+// addition, because x + 0 changes -0.
 template <class V>
 V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
     if constexpr (std::is_arithmetic<V>::value) return x;
     return x - V{};
 }
 
-// Clamps x to [low, high]. NaN stays NaN; the limits must not be NaN.
+// Clamps x to [low, high]. NaN stays NaN. The limits must not be NaN.
 template <class V>
 V3DG_HD V3DG_INLINE V cut_to(Lane<V> low, Lane<V> high, V x) {
 #ifdef __CUDA_ARCH__

@@ -1,16 +1,16 @@
 #pragma once
 
-// Rotations by quaternions (w, x, y, z), which may have any length but zero. A
-// quaternion that is not finite gives a matrix of NaN.
+// Rotations by quaternions (w, x, y, z) of any nonzero length. A quaternion that is not
+// finite gives a matrix of NaN.
 
 #include "math/lanes.h"
 
 namespace v3dg {
 
-// The range of squared lengths that are computed without underflow or overflow. For
-// other quaternions, down to the smallest denormal numbers, multiplying by `up` or
-// `down` brings the length into the range. `up` and `down` are powers of two, so
-// nothing is rounded.
+// The range of squared lengths that are computed without underflow or overflow. Any
+// other quaternion, down to the smallest denormal numbers, can be multiplied by `up` or
+// `down` to bring its length into the range. Both are powers of two, so nothing is
+// rounded.
 template <class T>
 struct QuatRange {
     static constexpr T least2 = T(0x1p-80), most2 = T(0x1p100), up = T(0x1p100), down = T(0x1p-100);
@@ -25,7 +25,7 @@ V3DG_HD V3DG_INLINE V length2_of_quat(const V q[4]) {
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
 }
 
-// Returns whether a squared length is out of range. Returns false for NaN.
+// Returns whether a squared length is out of this range. Returns false for NaN.
 template <class V>
 V3DG_HD V3DG_INLINE auto is_out_of_range(V length2) {
     using Range = QuatRange<Lane<V>>;
@@ -33,7 +33,7 @@ V3DG_HD V3DG_INLINE auto is_out_of_range(V length2) {
 }
 
 // If the squared length of a quaternion is out of range, multiplies the quaternion by a
-// power of two that brings it into range. Returns the factor, or 1.
+// power of two that brings it into range. Returns that factor, or 1.
 template <class V>
 V3DG_HD V3DG_INLINE V bring_into_range(V q[4]) {
     using Range = QuatRange<Lane<V>>;
@@ -53,8 +53,8 @@ V3DG_HD V3DG_INLINE void normalise_quat(T q[4]) {
     for (int k = 0; k < 4; ++k) q[k] = length2 == 0 ? static_cast<T>(k == 0) : q[k] / length;
 }
 
-// Rounds a quaternion to float32. It is normalised first if its squared length is out
-// of the range of float32.
+// Rounds a quaternion to float32. If its squared length is out of the range of float32,
+// it is normalised first.
 V3DG_HD V3DG_INLINE void round_quat(double q[4], float out[4]) {
     const double length2 = length2_of_quat(q);
     const bool is_held = length2 >= QuatRange<float>::least2 && length2 <= QuatRange<float>::most2;
@@ -77,9 +77,9 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     r[8] = 1 - s * (x * x + y * y);
 }
 
-// Computes the row-major rotation matrix of a quaternion of any length. Lengths out of
-// range are rare; such lanes are computed a second time. The other lanes keep their
-// first result, so that the rounding of a lane does not depend on other lanes.
+// Computes the row-major rotation matrix of a quaternion of any length. Lanes with
+// lengths out of range are rare; they are computed a second time. The other lanes keep
+// their first result, so that the rounding in a lane does not depend on other lanes.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     const V n2 = length2_of_quat(q);
@@ -110,8 +110,8 @@ V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const
         s * (x * (g[1] + g[3]) + z * (g[5] + g[7]) + w * (g[2] - g[6]) - 2 * y * (g[0] + g[8]));
     const V d_z =
         s * (x * (g[2] + g[6]) + y * (g[5] + g[7]) + w * (g[3] - g[1]) - 2 * z * (g[0] + g[4]));
-    // The matrix does not depend on the length of the quaternion. So remove the
-    // component of the gradient along the quaternion.
+    // The matrix does not depend on the length of the quaternion. Therefore the
+    // component of the gradient along the quaternion is removed.
     const V along = (w * d_w + x * d_x + y * d_y + z * d_z) * (s / 2);
     g_q[0] = d_w - along * w;
     g_q[1] = d_x - along * x;
@@ -119,8 +119,8 @@ V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const
     g_q[3] = d_z - along * z;
 }
 
-// Like rotation_of_quat_in_range_vjp(), for quaternions of any length. The gradient is
-// in proportion to 1 / length, up to the largest float.
+// Like rotation_of_quat_in_range_vjp(), but for quaternions of any length. The gradient
+// is proportional to 1 / length, up to the largest float.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat_vjp(const V q[4], const V g[9], V g_q[4]) {
     const V n2 = length2_of_quat(q);

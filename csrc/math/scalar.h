@@ -11,8 +11,8 @@
 
 namespace v3dg {
 
-// The two values are variables, because nvcc does not allow calls of the host's
-// constexpr functions in device code.
+// The two values are stored in variables, because nvcc does not allow calls of the
+// host's constexpr functions in device code.
 template <class T>
 constexpr T kLargest = std::numeric_limits<T>::max();
 template <class T>
@@ -40,10 +40,10 @@ V3DG_HD inline int floor_to_int(float x) {
 #endif
 }
 // Returns 1 / x with a relative error below 1e-6, which suffices for margins. x must be
-// positive; denormal numbers count as the smallest normal number.
+// positive. Denormal numbers are treated as the smallest normal number.
 V3DG_HD inline float rough_reciprocal(float x) {
 #ifdef __CUDA_ARCH__
-    float inverse;  // skips the handling of numbers out of range
+    float inverse;  // this instruction does not handle numbers out of range
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(fmaxf(x, 1.17549435e-38f)));
     return inverse;
 #else
@@ -70,14 +70,14 @@ V3DG_HD inline float saturated_fma(float a, float b, float c) {
     return x > 0 ? (x < 1 ? x : 1.0f) : 0.0f;
 #endif
 }
-// Returns `bits` shifted left by round(8 x), for x in [0, 1]. Ties may be rounded
-// either way.
+// Returns `bits` shifted left by round(8 x), for x in [0, 1]. A tie may be rounded up
+// or down.
 V3DG_HD inline uint32_t shifted_by_eighths(uint32_t bits, float x) {
     const float number = 8 * x + 8388608.0f;  // adding 2^23 rounds to an integer
     uint32_t last_bits;
     std::memcpy(&last_bits, &number, sizeof last_bits);
 #ifdef __CUDA_ARCH__
-    // The instruction uses the last five bits of the shift.
+    // The instruction only uses the last five bits of the shift.
     return __funnelshift_l(0u, bits, last_bits);
 #else
     return bits << (last_bits & 31);

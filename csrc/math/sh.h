@@ -1,7 +1,8 @@
 #pragma once
 
-// Real spherical harmonics of degrees 0 to 3, with the order and signs of .ply assets.
-// The colour of a gaussian is max(0, 1/2 + sum of coefficient * basis(view direction)).
+// Real spherical harmonics of degrees 0 to 3, with the order and signs that .ply files
+// use. The colour of a gaussian is max(0, 1/2 + sum of coefficient * basis(view
+// direction)).
 
 #include "math/vec.h"
 
@@ -9,7 +10,7 @@ namespace v3dg {
 
 constexpr int kMaxShDegree = 3, kMaxShBases = 16;
 constexpr double kShBase0 = 0.28209479177387814;  // the constant basis of degree 0
-// The degree of plain colours: three numbers, possibly negative, instead of
+// The degree of plain colours, which are three numbers (possibly negative) instead of
 // coefficients.
 constexpr int kPlainColor = -1;
 
@@ -80,12 +81,12 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
     g_dir[2] = gz;
 }
 
-// Computes the colour of a gaussian. `direction` is from the eye to the gaussian, in
-// model space, and may have any length. A channel that is not finite becomes 0;
-// otherwise it would make pixels NaN in which the gaussian has weight 0.
+// Computes the colour of a gaussian. `direction` points from the eye to the gaussian,
+// in model space, and may have any length. A channel that is not finite becomes 0.
+// Otherwise, pixels in which the gaussian has weight 0 would become NaN.
 //
-// sh(k) returns the k-th coefficient, of one gaussian or of one per lane: basis by
-// basis, three channels each. Each coefficient is requested once, in this order.
+// sh(k) returns the k-th coefficient, of one gaussian or of one per lane, basis by
+// basis with three channels each. Each coefficient is requested once, in this order.
 template <class V, class Coefficient>
 V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
                                                const Coefficient& sh, V color[3]) {
@@ -122,8 +123,8 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* 
     color_of_coefficients(degree, direction, [&](int k) { return sh[k]; }, color);
 }
 
-// Propagates the gradient of the colour: adds to `d_direction`, and sets `d_sh`, which
-// may be the same memory as `sh`.
+// Propagates the gradient of the colour. Adds to `d_direction`, and writes `d_sh`,
+// which may be the same memory as `sh`.
 template <class V>
 V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V direction[3], const V* sh,
                                          const V color[3], const V d_color[3], V d_direction[3],

@@ -1,9 +1,9 @@
 #pragma once
 
-// The operations of scalar.h for SIMD vectors, as wide as the instruction set of the
-// compilation allows. They exist only in sources that are compiled once per instruction
-// set. They are always inlined, so that the linker cannot share them between
-// instruction sets. Formulas include lanes.h instead of this file.
+// The operations of scalar.h for SIMD vectors that are as wide as the instruction set
+// of the compilation allows. They only exist in sources that are compiled once per
+// instruction set. They are always inlined, so that the linker cannot use the same code
+// for different instruction sets. Formulas include lanes.h instead of this file.
 
 #include <cmath>
 #include <cstdint>
@@ -73,8 +73,9 @@ V3DG_INLINE Vec<double> sqrt_of(Vec<double> x) {
     return x;
 }
 
-// Returns a mask whose bit i is set if a comparison is true in lane i. The conversion
-// uses the size of lanes, because compilers differ in the type of 64-bit lanes.
+// Returns a mask in which bit i is set if a comparison is true in lane i. The
+// conversion uses the size of a lane, because the type of 64-bit lanes depends on the
+// compiler.
 template <class Mask>
 V3DG_INLINE unsigned bits_of(Mask mask) {
     if constexpr (sizeof(mask[0]) == 4) {
@@ -102,9 +103,9 @@ V3DG_INLINE unsigned sign_bits_of(V x) {
     return bits_of((Mask)x >> (8 * sizeof(x[0]) - 1));
 }
 
-// Returns 2^x for x in [-126, 127], with a relative error below 2^-22. The result is
-// undefined for other x. The integer part of x becomes the exponent. A minimax
-// polynomial on [-1/2, 1/2] computes the rest.
+// Returns 2^x for x in [-126, 127], with a relative error below 2^-22. For other x, the
+// result is undefined. The integer part of x becomes the exponent; a minimax polynomial
+// on [-1/2, 1/2] approximates the rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
     // Adding 1.5 * 2^23 rounds to an integer.
     const Vec<float> magic = Vec<float>{} + 12582912.0f;
@@ -193,7 +194,7 @@ V3DG_INLINE void store(T* p, Vec<T> v) {
 }
 
 #if defined(__SSE2__)
-// Versions with a single instruction, which replace the templates in lanes.h.
+// Versions that are a single instruction. They replace the templates in lanes.h.
 V3DG_INLINE Vec<float> max_of(Vec<float> a, Vec<float> b) {
 #if defined(__AVX512F__)
     return (Vec<float>)_mm512_max_ps((__m512)a, (__m512)b);

@@ -14,12 +14,12 @@ namespace v3dg {
 // A similarity transform p -> scale * rotation p + position.
 struct Pose {
     const double* position;    // [3]
-    const double* quaternion;  // [4] w x y z, of any length but zero
+    const double* quaternion;  // [4] w x y z, of any nonzero length
     double scale;
 };
 
-// Returns whether a pose is valid: it is finite, its scale is positive, and its
-// quaternion is not zero. An instance with an invalid pose is not drawn.
+// Returns whether a pose is valid. It must be finite, with a positive scale and a
+// nonzero quaternion. Instances with invalid poses are not drawn.
 V3DG_HD inline bool is_placed(const Pose& pose) {
     double sum = pose.scale;
     for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
@@ -57,7 +57,8 @@ V3DG_HD inline InstanceAxes axes_of_instance(const CameraPose& camera, const Pos
             out.axes[3 * row + k] = axis;
         }
         out.origin[row] = origin * inverse_scale;
-        // Clamp, so that squared distances are finite. The cut is exact for any eye.
+        // Clamp, so that squared distances are finite. The cut is exact for any
+        // position of the eye.
         out.eye[row] = min_of(max_of(eye * inverse_scale, -1e18), 1e18);
     }
     return out;

@@ -1,7 +1,7 @@
 #pragma once
 
 // The pose of a camera in the world, and the transform from model space to view space.
-// They do not depend on the camera model (camera/camera.h).
+// Neither depends on the camera model (camera/camera.h).
 
 #include <cstdint>
 #include <cstring>
@@ -12,23 +12,25 @@ namespace v3dg {
 
 // The position and orientation of a camera in the world, in double precision.
 struct CameraPose {
-    double rotation[9];     // world to camera, row major
-    double translation[3];  // world to camera
+    double rotation[9];     // from world to camera, row major
+    double translation[3];  // from world to camera
     double eye[3];          // position of the camera in the world
 };
 
 // The transform from model space to view space: linear * (point - eye) + translation,
-// where `linear` is a uniform scale times a rotation. Subtracting the eye first
+// where `linear` is a rotation times a uniform scale. Subtracting the eye first
 // preserves the precision of nearby points, even far from the origin.
 template <class T>
 struct ModelView {
     T linear[9];            // row major
-    T translation[3];       // correction for the rounding of `eye`, in view space
-    T eye[3], eye_rest[3];  // eye + eye_rest: position of the camera in model space
+    T translation[3];       // corrects the rounding of `eye`, in view space
+    T eye[3], eye_rest[3];  // the position of the camera in model space is eye +
+                            // eye_rest
 };
 
-// Returns the leading 24 bits of a number, which a float can represent. Bits are
-// masked, because GCC 12 replaces (double)(float)x by x in vectorised code.
+// Returns the leading 24 bits of a number, which a float can represent. The other bits
+// are masked instead of converting to float and back, because GCC 12 replaces
+// (double)(float)x by x in vectorised code.
 V3DG_HD inline double leading_bits(double x) {
     uint64_t bits;
     std::memcpy(&bits, &x, sizeof bits);
@@ -37,8 +39,8 @@ V3DG_HD inline double leading_bits(double x) {
     return x;
 }
 
-// Sets the eye and the translation of a view. `translation` is the translation t of the
-// transform linear * point + t.
+// Sets the eye and the translation of a view. `translation` is the t of the transform
+// linear * point + t.
 template <class T>
 V3DG_HD inline void set_eye(const double linear[9], const double translation[3],
                             const double eye[3], ModelView<T>& view) {
@@ -67,8 +69,8 @@ V3DG_HD V3DG_INLINE void from_eye(const ModelView<T>& mv, const V point[3], V di
     for (int k = 0; k < 3; ++k) direction[k] = point[k] - mv.eye[k] - mv.eye_rest[k];
 }
 
-// Computes the position of a camera: the point that its world-to-camera matrix maps to
-// 0. The rotation may have rounding errors of float32.
+// Computes the position of a camera, which its world-to-camera matrix maps to 0. The
+// rotation may have rounding errors of float32.
 V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
     // The columns of the inverse are cross products of the rows, divided by the
     // determinant.

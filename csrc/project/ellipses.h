@@ -1,7 +1,7 @@
 #pragma once
 
-// The 2D ellipses of all gaussians, including gaussians that are not drawn. Training
-// uses the ellipses to decide where to add and to remove gaussians.
+// Computes the 2D ellipses of all gaussians, even of those that are not drawn. Training
+// uses them to decide where to add and remove gaussians.
 
 #include <cstdint>
 
@@ -10,17 +10,17 @@
 
 namespace v3dg {
 
-// One row per gaussian. All values of a gaussian are zero if it is not visible: its
-// depth is outside of the near and far limits, its alpha is below 1/255 everywhere, it
-// is outside of the image, or its radius is at most `min_radius_px`.
+// One row per gaussian. All values of an invisible gaussian are zero. A gaussian is
+// invisible if its depth is not between the near and far limits, its alpha is below
+// 1/255 everywhere, it is outside the image, or its radius is at most `min_radius_px`.
 template <class T>
 struct Ellipses {
     T* centers;    // (N, 2) px
     T* depths;     // (N,)
     T* conics;     // (N, 3) inverse covariances as xx, xy, yy; 1 / px²
-    T* opacities;  // (N,) used for blending: includes the antialiasing factor
-    // (N, 2) half width and half height, px, of the box in which alpha is at least
-    // 1/255; rounded up.
+    T* opacities;  // (N,) as used for blending, including the antialiasing factor
+    // (N, 2) half width and half height, px, rounded up, of the box in which alpha is
+    // at least 1/255
     int32_t* radii;
 };
 

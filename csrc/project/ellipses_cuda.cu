@@ -8,7 +8,7 @@ namespace {
 
 constexpr int kThreads = 256;
 
-// One thread per gaussian.
+// Launched with one thread per gaussian.
 __global__ void ellipses_kernel(EllipsesInput<float> in, Ellipses<float> out) {
     const size_t i = blockIdx.x * static_cast<size_t>(kThreads) + threadIdx.x;
     if (i < in.rows.size) in.write(i, out);

@@ -1,6 +1,6 @@
 #pragma once
 
-// Reads vectors of gaussians from the memory of models on the host. Included only by
+// Loads vectors of gaussians from the memory of models on the host. Only included by
 // sources that are compiled once per instruction set.
 
 #include <algorithm>
@@ -14,7 +14,7 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// Requests the cache lines that row i begins in, in all planes.
+// Prefetches the cache lines in which row i begins, in all planes.
 template <class T>
 V3DG_INLINE void prefetch_row(const GaussianPlanes<T>& m, uint64_t i) {
     for (int k = 0; k < 3; ++k) __builtin_prefetch(m.mean[k] + i);
@@ -24,15 +24,15 @@ V3DG_INLINE void prefetch_row(const GaussianPlanes<T>& m, uint64_t i) {
     for (int k = 0; k < 3 * num_sh_bases(m.sh_degree); ++k) __builtin_prefetch(m.sh[k] + i);
 }
 
-// Reads gaussians from planes (one array per component).
+// Loads gaussians from planes (one array per component).
 template <class T>
 struct PlaneSource {
     const GaussianPlanes<T>& m;
     NextRun<T> next = {};
 
-    // Requests gaussians that are read soon, while row i of a run is projected. The run
-    // has `left` rows from row i on. Clusters are short, and a processor recognises
-    // only a few of the many planes as streams.
+    // Prefetches gaussians that are needed soon. Row i of a run is being projected, and
+    // the run has `left` rows from i on. Hardware prefetching is not enough: clusters
+    // are short, and a processor recognises only a few of the many planes as streams.
     V3DG_INLINE void prefetch(uint64_t i, uint64_t left) const {
         constexpr uint64_t kRowsAhead = 64;
         if (left > kRowsAhead)
@@ -41,8 +41,8 @@ struct PlaneSource {
             prefetch_row(*next.model, next.first + (kRowsAhead - left));
     }
 
-    // Loads a vector of gaussians that starts at row i. All lanes may be read, because
-    // planes are padded.
+    // Loads a vector of gaussians that starts at row i. Reading all lanes is safe,
+    // because planes are padded.
     V3DG_INLINE Gaussian3d<Vec<T>> load_gaussians(uint64_t i, uint64_t) const {
         Gaussian3d<Vec<T>> g;
         for (int k = 0; k < 3; ++k) g.mean[k] = load(m.mean[k] + i);
@@ -58,7 +58,7 @@ struct PlaneSource {
     }
 };
 
-// Reads the coded gaussians of one cluster. Lanes beyond the end of the cluster repeat
+// Loads the coded gaussians of one cluster. Lanes beyond the end of the cluster repeat
 // its last gaussian.
 struct CodeSource {
     using V = Vec<float>;
@@ -100,8 +100,8 @@ struct CodeSource {
     }
 };
 
-// Loads the palette colours of gaussians `at`, `at` + 1, ... for the lanes whose bits
-// are set in `kept`. Other lanes become 0.
+// Loads the palette colours of gaussians `at`, `at` + 1, ... into those lanes whose
+// bits are set in `kept`. All other lanes become 0.
 template <class V>
 V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsigned kept, V sh[3]) {
     for (int k = 0; k < 3; ++k) sh[k] = V{};
@@ -112,8 +112,8 @@ V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsigned kept
     }
 }
 
-// Calls body(source, first, count) for the part of each cluster in the coded rows
-// [start, start + count).
+// Calls body(source, first, count) for the part of each cluster that is in the coded
+// rows [start, start + count).
 template <class Body>
 V3DG_INLINE void for_clusters(const Codes& codes, uint64_t start, uint64_t count,
                               const Body& body) {

@@ -1,6 +1,6 @@
 #pragma once
 
-// Large records: projected gaussians that cover many tiles. The functions below pass
+// Large records are projected gaussians that cover many tiles. These functions pass
 // them to tile_bin in batches.
 
 #include "frame/tile_list.h"
@@ -9,8 +9,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Splits the rows of tiles of a large record evenly into `count` parts, and returns one
-// part. The record of an empty part is kNoRecord.
+// Divides the rows of tiles of a large record evenly into `count` parts, and returns
+// one of them. If the part is empty, its record is kNoRecord.
 __device__ inline LargeRecord part_of(LargeRecord large, int part, int count) {
     const int top = large.box.y0 / kFrameTileHeight,
               rows = static_cast<int>(tile_rows_of(large.box));
@@ -22,9 +22,9 @@ __device__ inline LargeRecord part_of(LargeRecord large, int part, int count) {
 }
 
 // Moves the item's large records from the queue to the output, in whole batches. An
-// incomplete batch stays in the queue, unless `is_end` is set; then it is padded. A
-// batch that covers very many tiles is split into several batches, each with a part of
-// every record.
+// incomplete batch stays in the queue; if `is_end` is set, it is padded and moved. A
+// batch that covers very many tiles is divided into several batches, each with a part
+// of every record.
 template <class Model>
 __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters,
                             const ProjectOutput& out, bool is_end) {

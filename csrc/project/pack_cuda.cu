@@ -54,8 +54,8 @@ __device__ Gaussian3d<float> decoded(const PageCodes<const uint32_t>& codes, siz
     return gaussian;
 }
 
-// One block per page. `sh` receives the coefficients of degree 1 and above; `planes`
-// receive the colour of degree 0.
+// Launched with one block per page. `sh` receives the coefficients of degree 1 and
+// above; `planes` receive the colour of degree 0.
 __global__ void pack_pages_kernel(const PageRows* pages, float4* planes, size_t num_rows, float* sh,
                                   int sh_stride) {
     const PageRows page = pages[blockIdx.x];

@@ -1,8 +1,8 @@
 #pragma once
 
-// The gradient of a picture with respect to the pose of its camera: the matrix R and
-// the vector t that map a point x of the world to R x + t. The nine elements of R count
-// as independent variables, and the eye is -R⁻¹ t.
+// The gradient of a picture with respect to the pose of its camera. The pose is the
+// matrix R and the vector t that map a point x of the world to R x + t. The nine
+// elements of R are independent variables, and the eye is -R⁻¹ t.
 
 #include "camera/camera.h"
 #include "math/gaussian.h"
@@ -11,12 +11,13 @@
 
 namespace v3dg {
 
-// Sums over gaussians, from which the gradient of a pose follows.
+// Sums over gaussians from which the gradient of a pose is computed.
 template <class V>
 struct PoseSums {
-    V linear[9];     // with respect to R, for points relative to ModelView::eye
-    V shift[3];      // with respect to t
-    V direction[3];  // with respect to the vectors from the eye to the gaussians
+    V linear[9];     // gradient with respect to R, for points relative to ModelView::eye
+    V shift[3];      // gradient with respect to t
+    V direction[3];  // gradient with respect to the vectors from the eye to the
+                     // gaussians
 };
 constexpr int kPoseValues = 15;
 static_assert(sizeof(PoseSums<float>) == kPoseValues * sizeof(float), "");
@@ -30,8 +31,8 @@ V3DG_HD V3DG_INLINE void add(const PoseSums<V>& part, PoseSums<V>& sums) {
     }
 }
 
-// A camera that also stores the gradients in view space that linearized_vjp() computes:
-// those of a point, and those of a gaussian's axes.
+// A camera that also stores the gradients in view space that linearized_vjp() computes,
+// namely those of a point and of a gaussian's axes.
 template <ProjectingModel C, class V>
 struct ViewProbe : C {
     V* d_point;  // (3)
@@ -58,8 +59,8 @@ V3DG_HD V3DG_INLINE auto probed(const C& camera, V* d_point, V* d_axes) {
         return camera;
 }
 
-// Sets the sums of one gaussian from the gradients of its centre and of its axes in
-// view space (ViewProbe), and of the vector from the eye to its centre.
+// Computes the terms of one gaussian from three gradients: of its centre and of its
+// axes in view space (ViewProbe), and of the vector from the eye to its centre.
 template <class V, class T>
 V3DG_HD V3DG_INLINE void pose_vjp(const Gaussian3d<V>& g, const ModelView<T>& view,
                                   const V d_point[3], const V d_axes[9], const V d_direction[3],

@@ -1,7 +1,6 @@
 #pragma once
 
-// Projection on the CPU: the interface. The functions are compiled once per instruction
-// set.
+// Projection on the CPU. The functions are compiled once per instruction set.
 
 #include <climits>
 #include <cstddef>
@@ -16,20 +15,22 @@
 
 namespace v3dg {
 
-// The coverage of a run of gaussians in the whole image, not only in the window that is
+// How much a run of gaussians covers in the whole image, not only in the window that is
 // drawn.
 struct Reach {
     uint64_t in_frustum = 0;  // number of gaussians whose extent meets the image
     uint64_t drawn = 0;       // number of gaussians that reach a pixel centre
-    uint64_t entries = 0;     // number of (gaussian, tile) pairs of the drawn gaussians
-    // The pixel rows that the drawn gaussians cover.
+    uint64_t entries = 0;     // number of (gaussian, tile) pairs of gaussians that are
+                              // drawn
+    // Range of the pixel rows that the drawn gaussians cover.
     int top = INT_MAX, bottom = INT_MIN;
 };
 
-// Gaussians that will be projected next, and are loaded into the cache meanwhile.
+// Gaussians that will be projected next. They are prefetched into the cache.
 template <class T>
 struct NextRun {
-    const GaussianPlanes<T>* model = nullptr;  // null: none, or coded gaussians
+    const GaussianPlanes<T>* model = nullptr;  // null if there are none, or if they are
+                                               // coded
     uint64_t first = 0;
 };
 
@@ -38,22 +39,22 @@ struct NextRun {
 // positive and finite, and it reaches a pixel centre in the window. Writes a record for
 // each drawn gaussian, in order, and returns the number of records.
 //
-// The window is empty or inside the camera's image. Unless `source` is null, source[r]
-// becomes `source_base` plus the index, relative to `skip`, of the gaussian of record
-// r. `next` changes no result.
+// The window must be empty or inside the camera's image. If `source` is not null,
+// source[r] is set to `source_base` plus the index, relative to `skip`, of the gaussian
+// of record r. `next` is only a hint and does not change the result.
 V3DG_DECLARE_PER_ISA(template <class T> size_t project(const Draw<T>& draw, uint64_t skip,
                                                        uint64_t count, const Intrinsics<T>& camera,
                                                        const Window& window, Record<T>* records,
                                                        uint32_t* source, uint32_t source_base,
                                                        Reach& reach, const NextRun<T>& next = {}))
 
-// Computes the gradients of gaussians from the gradients of their records. The index of
-// record r's gaussian in the draw is source[r].
+// Computes the gradients of gaussians from the gradients of their records. source[r] is
+// the index in the draw of record r's gaussian.
 V3DG_DECLARE_PER_ISA(template <class T>
                      void project_backward(const Draw<T>& draw, const uint32_t* source,
                                            const RecordGradient<T>* d_records, size_t count,
                                            const Intrinsics<T>& camera, const GaussianRows<T>& out))
-// Like project_backward(), but adds to `out`. Unless `pose` is null, it also adds the
+// Like project_backward(), but adds to `out`. If `pose` is not null, it also adds the
 // terms of the gradient of the camera's pose.
 V3DG_DECLARE_PER_ISA(template <class T> void add_project_backward(
     const Draw<T>& draw, const uint32_t* source, const RecordGradient<T>* d_records, size_t count,

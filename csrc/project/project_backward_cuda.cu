@@ -1,5 +1,5 @@
-// The backward pass of projection on CUDA. A block processes an item, a thread one
-// record. A block loads the SH coefficients of its gaussians into shared memory and
+// The backward pass of projection on CUDA. A block processes an item, and a thread one
+// record. The block loads the SH coefficients of its gaussians into shared memory, and
 // overwrites them there with their gradients.
 
 #include <type_traits>
@@ -15,7 +15,7 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = kItemSize;
-// SH words that a thread loads before it stores any of them
+// number of SH words that a thread loads before it stores any of them
 constexpr int kWordsAtOnce = 6;
 
 __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
@@ -48,8 +48,8 @@ __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
     }
 }
 
-// The layout of a row of SH coefficients in shared memory. The stride is odd, which
-// avoids bank conflicts.
+// The layout of a row of SH coefficients in shared memory. The stride is odd to avoid
+// bank conflicts.
 template <int kDegree>
 struct ShRow {
     static constexpr int kValues = 3 * num_sh_bases(kDegree);
@@ -108,7 +108,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     const uint64_t i = is_record ? in.source[record] : 0;  // gaussian of the record
     Gaussian3d<float> g{};
     float color[3] = {0, 0, 0};
-    if (is_record) {  // The loads are in flight while the slots are summed.
+    if (is_record) {  // these loads are in flight while the slots are summed
         load_row(in.rows.means, i, g.mean);
         load_row(in.rows.quats, i, g.quat);
         load_row(in.rows.scales, i, g.scale);
@@ -149,7 +149,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     __syncthreads();
 
     // Without a batch, the output row of a gaussian is its row in the model. In a
-    // batch, each item has rows of its own.
+    // batch, each item has output rows of its own.
     const uint64_t first_out = kIsBatch ? first_record : first;
     if (used) {
         const ModelView<float>& view = view_of_block<kIsBatch>(in, batch);
@@ -190,8 +190,8 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
                         : Word{};
 }
 
-// Sums the sizes of the gradients of each gaussian's centre. `sizes` must be zero
-// initially.
+// Sums the sizes of the gradients of each gaussian's centre. `sizes` must initially be
+// zero.
 __global__ void __launch_bounds__(kThreads)
     center_sizes_kernel(ProjectBackwardInput in, GradientSlots slots, CenterSize<float>* sizes) {
     const uint64_t record = static_cast<uint64_t>(blockIdx.x) * kItemSize + threadIdx.x;

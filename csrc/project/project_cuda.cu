@@ -33,17 +33,18 @@ constexpr unsigned kBlocks = 4;  // resident blocks per multiprocessor
 constexpr float kSmall = 3;
 constexpr unsigned kManySmall = 4;
 // If at least kNearlyAll of 32 gaussians pass the sphere test, the next gaussians skip
-// the test. The test resumes when fewer than kMany of 32 gaussians become records.
+// the test. It resumes when fewer than kMany of 32 gaussians become records.
 constexpr unsigned kNearlyAll = 22, kMany = 12;
 
 // Projects the item whose tables the warp has loaded, and returns its number of
 // records. `factors` points to the factors of the item's placement or, in a shared
-// item, of all its placements. It is null if the source has no factors.
+// item, of all its placements. It is null if the source does not use factors.
 template <class Source, bool kIsShared, class C>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
                                  const InstanceFactors* factors, FrameCounters& counters,
                                  const ProjectOutput& out, unsigned& num_in_frustum) {
-    constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians per iteration
+    constexpr unsigned kRound = kIsShared ? 1 : 32;  // number of gaussians per
+                                                     // iteration
     const auto& tables = space.tables;
     const unsigned lane = threadIdx.x % 32, count = tables.item.count;
     if (lane == 0) space.num_large = 0;
@@ -102,8 +103,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             __syncwarp();
             const bool are_nearly_all = !kIsShared && __popc(come) >= kNearlyAll;
             if (waiting < 32 && first + kRound < count && !are_nearly_all) continue;
-            // After the last gaussian, more than 32 gaussians may be left in the queue;
-            // the next iterations project them.
+            // After the last gaussian, more than 32 gaussians may be left in the queue.
+            // They are projected in the next iterations.
             const unsigned taken = min(waiting, 32u);
             may_reach = lane < taken;
             if (may_reach) mine = space.queue[(head + lane) % kQueue];
@@ -134,7 +135,7 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
 }
 
 // Adds the counts of an item to the counts of its image. `num_in_frustum` is the number
-// of this lane. All lanes of the warp must call it.
+// that this lane has counted. All lanes of the warp must call it.
 template <class Model>
 __device__ void report_image(const ItemTables<Model>& tables, unsigned num_in_frustum,
                              ImageCounts* image_counts) {
@@ -178,11 +179,11 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
-    // A warp without an item skips the loop and reads the tile queue at once.
+    // A warp without an item skips the loop, and reads the tile queue immediately.
     __syncwarp();
-    // Warps claim items from a counter, because the number of visible gaussians per
-    // item varies widely. A warp claims its next item when it starts the current one,
-    // to hide the latency of the atomic operation.
+    // The number of visible gaussians per item varies widely, so warps claim items from
+    // a counter. A warp claims its next item when it starts the current one, which
+    // hides the latency of the atomic operation.
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const uint32_t item_word = load_word(in.items.items[i]);
         const unsigned next = take_next(taken, gridDim.x * kWarps);
@@ -221,7 +222,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
-    // A warp without an item skips the loop and reads the tile queue at once.
+    // A warp without an item skips the loop, and reads the tile queue immediately.
     __syncwarp();
     for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items;
          first += 32 * stride) {
@@ -260,8 +261,8 @@ static void project_shared(const typename Source::Model* models, const ProjectIn
                  stream, in, models, out);
 }
 
-// Launches the kernels for one source. `SharedSource` reads the models of shared items;
-// it has no fades, because shared items have weight 1.
+// Launches the kernels for one source. `SharedSource` reads the models of shared items.
+// It does not support fades, because shared items have weight 1.
 template <class Source, class SharedSource, class C = Pinhole<float>>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, int taken, cudaStream_t stream) {
@@ -286,7 +287,8 @@ static void project_instances(const typename Source::Model* models, const Projec
 template <class Source>
 static void project_scene(const typename Source::Model* models, const ProjectInput& in,
                           const ProjectOutput& out, int taken, cudaStream_t stream) {
-    // Frames with lenses have fewer kernels: an item that is not faded has weight 1.
+    // Frames with lenses use fewer kernels: those for fades also draw items that are
+    // not faded, whose weight is 1.
     if (in.has_lenses && in.factors != nullptr)
         project_from<Faded<Tinted<Source>>, Tinted<Source>, Intrinsics<float>>(models, in, out,
                                                                                taken, stream);

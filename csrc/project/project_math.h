@@ -5,9 +5,9 @@
 //
 // This is EWA projection (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl
 // et al. 2023), for any camera model (camera/camera.h). The 2D covariance is A Aᵀ +
-// filter I with the 2x3 matrix A = J W R S; J is the Jacobian of the camera model. Its
-// determinant is |a1 x a2|² plus positive terms, so no digits cancel, however thin the
-// gaussian is.
+// filter I, with the 2x3 matrix A = J W R S, where J is the Jacobian of the camera
+// model. Its determinant is |a1 x a2|² plus positive terms, so there is no
+// cancellation, however thin the gaussian is.
 
 #include "camera/camera.h"
 #include "frame/draw_list.h"
@@ -18,7 +18,7 @@
 
 namespace v3dg {
 
-// Intermediate results of the projection. The backward pass reuses them.
+// Intermediate results of the projection, which the backward pass reuses.
 template <class V, ProjectingModel C>
 struct Projection {
     V p[3];          // mean, in view space
@@ -29,13 +29,13 @@ struct Projection {
 };
 
 // The upper limit of a limited filter, as a multiple of the square root of the
-// determinant of the gaussian's own 2D covariance. A round gaussian then keeps at least
-// a fifth of its opacity. Without the limit, the alphas of many tiny gaussians that
-// together cover an area could all fall below 1/255, and the area would vanish.
+// determinant of the gaussian's own 2D covariance. With this limit, a round gaussian
+// keeps at least a fifth of its opacity. Without it, an area that is covered by many
+// tiny gaussians could vanish, because all of their alphas could fall below 1/255.
 constexpr float kMostFilterOfVariance = 4;
 
-// Returns the ellipse with covariance A Aᵀ + filter I, without its opacity. `s` must
-// contain p, the Jacobian, and the rows a1 and a2 of A.
+// Returns the ellipse with covariance A Aᵀ + filter I, but does not set its opacity.
+// `s` must have p, the Jacobian, and the rows a1 and a2 of A.
 template <class V, ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const C& cam, Lane<V> most_filter_px2,
                                                bool is_limited, Projection<V, C>& s) {
@@ -61,9 +61,9 @@ V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const C& cam, Lane<V> most_filter
 }
 
 // Returns the ellipse of a gaussian. Precondition: s.p is set, and its depth is
-// positive. `filter_px2` is added to both variances. If `antialiased`, the opacity is
-// multiplied by sqrt(determinant before / after adding the filter), which preserves the
-// gaussian's integral over the image.
+// positive. `filter_px2` is added to both variances. If `antialiased` is true, the
+// opacity is multiplied by sqrt(determinant before / after adding the filter), which
+// preserves the gaussian's integral over the image.
 template <class V, class T, ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const ModelView<T>& mv,
                                                 const C& cam, T filter_px2, bool antialiased,
@@ -85,14 +85,15 @@ V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const Mo
     return e;
 }
 
-// Multiplies the opacity by `weight`, the weight of a cluster that fades in or out.
+// Multiplies the opacity by `weight`, which is below 1 for a cluster that fades in or
+// out.
 template <class V>
 V3DG_HD V3DG_INLINE void fade(Lane<V> weight, Ellipse<V>& e) {
     e.log2_opacity += log2_of(weight);
 }
 
 // Sets half_x and half_y: the half size, px, of the box in which alpha can be at least
-// 1/255. That is where |L d|² <= log2(255 alpha), with alpha at the centre. Returns
+// 1/255. This is where |L d|² <= log2(255 alpha), with alpha at the centre. Returns
 // false, and leaves the box undefined, if the depth is not finite or alpha is below
 // 1/255 everywhere.
 template <class V, ProjectingModel C>
@@ -107,8 +108,8 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
            (s.det > V{}) & (s.det < huge) & (half_x < huge) & (half_y < huge) & (e.depth < huge);
 }
 
-// Like project_gaussian(), for packed gaussians. Precondition: s.p is set. Leaves
-// s.linear_rs unset.
+// Like project_gaussian(), but for packed gaussians. Precondition: s.p is set.
+// s.linear_rs is not set.
 template <ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
                                                   const ModelView<float>& mv, const C& cam,
@@ -132,8 +133,8 @@ V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
     return e;
 }
 
-// Returns whether no pixel centre is within `half` of `center` along one axis, with the
-// same margin as pixel_span().
+// Returns whether no pixel centre is within `half` of `center` along one axis. The
+// margin is the same as in pixel_span().
 template <class T>
 V3DG_HD V3DG_INLINE bool misses_centers(T center, T half) {
     const T from_center = center - T(0.5);
@@ -148,8 +149,9 @@ V3DG_HD V3DG_INLINE auto meets_image(V center, V half, Lane<V> size) {
 
 // Computes the range of pixels, along one axis, whose centres are within `half` of
 // `center`: from ceil(low) to floor(high). A margin makes the range slightly too large,
-// so that only the blend step decides. For any input, including NaN, `low` is in [0,
-// size] and `high` in [-1, size - 1], so converting them to integers is safe.
+// so that only the blend step decides about a pixel. For any input, including NaN,
+// `low` is in [0, size] and `high` in [-1, size - 1], so they can safely be converted
+// to integers.
 template <class V>
 V3DG_HD V3DG_INLINE void pixel_span(V center, V half, Lane<V> size, V& low, V& high) {
     using T = Lane<V>;
@@ -189,7 +191,7 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
     V d_det = -d_l11 * e.l11 / (2 * s.det);
     V d_det0 = V{};
     Gaussian3d<V> out;
-    // log2_opacity = log2(opacity) + log2(det0 / det) / 2. The last term exists only if
+    // log2_opacity = log2(opacity) + log2(det0 / det) / 2. The last term only exists if
     // antialiased.
     out.opacity = d.log2_opacity / (T(kLn2) * g.opacity);
     if (antialiased) {

@@ -1,7 +1,7 @@
 // The backward pass of projection for several views. A block processes the gaussians of
-// an item, view after view, a thread one record. The sums over views are in shared
-// memory. A view adds to the row of a gaussian at most once, so the order of additions
-// is the order of the views.
+// an item, one view after another, and a thread one record. The sums over views are in
+// shared memory. A view adds to the row of a gaussian at most once, so the order of
+// additions is the order of the views.
 
 #include "project/pose_gradient.h"
 #include "project/project_math.h"
@@ -16,8 +16,7 @@ namespace {
 constexpr int kThreads = kItemSize;
 constexpr int kWarps = kThreads / 32;
 
-// The sums of one gaussian in shared memory. The stride is odd, which avoids bank
-// conflicts.
+// The sums of one gaussian in shared memory. The stride is odd to avoid bank conflicts.
 template <int kDegree>
 struct SumRow {
     static constexpr int kSh = 3 * num_sh_bases(kDegree);
@@ -25,8 +24,8 @@ struct SumRow {
     static constexpr int kStride = (kFirstSh + kSh) | 1;
 };
 
-// Adds without contraction, so that a sum has the bits of gradients that were stored
-// and added later.
+// Adds without contraction. So the sum has the same bits as if the gradients were
+// stored first and added later.
 template <int kWidth>
 __device__ void add_row(float* sums, const float* row) {
 #pragma unroll
@@ -34,7 +33,7 @@ __device__ void add_row(float* sums, const float* row) {
 }
 
 // Computes the gradients of gaussian i in one view from `d`, the gradient of its
-// record, and adds them to `sums`, the gaussian's row in shared memory.
+// record. Adds them to `sums`, the gaussian's row in shared memory.
 template <int kDegree, bool kWithPose>
 __device__ void add_gaussian(const ProjectViewsInput& in, const ViewsGradients& out, uint32_t view,
                              uint64_t i, uint64_t record, const RecordGradient<float>& d,
@@ -85,7 +84,7 @@ __device__ void add_gaussian(const ProjectViewsInput& in, const ViewsGradients& 
     }
 }
 
-// Writes the sum of a block's gaussians over the threads to `part`.
+// Writes the sum over the block's threads, and thus over its gaussians, to `part`.
 __device__ void sum_over_block(const PoseSums<float>& pose, float* part) {
     __shared__ float of_warp[kWarps][kPoseValues];
     const float* values = reinterpret_cast<const float*>(&pose);
@@ -101,7 +100,7 @@ __device__ void sum_over_block(const PoseSums<float>& pose, float* part) {
     part[threadIdx.x] = sum;
 }
 
-// Starts the sums of this thread's gaussian.
+// Initialises the sums of this thread's gaussian.
 template <int kDegree>
 __device__ void start_sums(const GaussianRows<float>& rows, uint64_t i, bool adds, float* sums) {
     using Row = SumRow<kDegree>;
@@ -114,7 +113,7 @@ __device__ void start_sums(const GaussianRows<float>& rows, uint64_t i, bool add
     for (int k = 0; k < Row::kSh; ++k) sums[Row::kFirstSh + k] = rows.sh[Row::kSh * i + k];
 }
 
-// `pose_parts` is (views, items, kPoseValues), zero initially.
+// `pose_parts` is (views, items, kPoseValues), and must initially be zero.
 template <int kDegree, bool kWithPose>
 __global__ void __launch_bounds__(kThreads, 2)
     project_views_backward_kernel(ProjectViewsInput in, GradientSlots slots, ViewsGradients out,
@@ -132,7 +131,7 @@ __global__ void __launch_bounds__(kThreads, 2)
         const uint64_t item = view * num_items + blockIdx.x;
         const uint32_t num_records = in.item_records[item];
         if (num_records == 0) continue;
-        __syncthreads();  // the sums over the views before are complete
+        __syncthreads();  // the sums of the previous views are complete
         const uint64_t record = item * kItemSize + threadIdx.x;
         const bool is_record = threadIdx.x < num_records;
         const uint64_t i = is_record ? in.source[record] : 0;
@@ -161,7 +160,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     if (!out.has_sh_for_each_view) store_row<Row::kSh>(out.rows.sh, own, mine + Row::kFirstSh);
 }
 
-// Adds up the parts of each view's pose. A block processes a view, a warp one value.
+// Sums the parts of each view's pose. A block processes a view, and a warp one value.
 __global__ void poses_kernel(const float* parts, uint32_t num_parts, const Placement* placements,
                              float* poses) {
     __shared__ PoseSums<double> sums;

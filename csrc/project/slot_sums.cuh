@@ -9,7 +9,8 @@
 namespace v3dg {
 namespace cuda {
 
-// One thread sums up to this many slots of a record; a warp sums more.
+// One thread sums up to this many slots of a record. If there are more, a warp sums
+// them.
 constexpr uint32_t kFewSlots = 16;
 
 template <class Value>
@@ -22,7 +23,7 @@ __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
 }
 
 // Sums `num` slots in a fixed order, so that the bits of the result are reproducible.
-// All lanes of the warp must call it. Returns whether any slot was written.
+// Returns whether any slot was written. All lanes of the warp must call it.
 template <class Value>
 __device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first,
                              uint32_t num, Value& sum) {

@@ -4,10 +4,10 @@
 // codes.
 //
 // A source computes a gaussian in steps, because most gaussians reach no pixel centre
-// and need only the first steps. fetch() loads the data of the bounding sphere.
+// and only need the first steps. fetch() loads the data of the bounding sphere.
 // sphere() returns the mean and the radius. project() returns the ellipse and the
 // colour; p of the Projection must be set. shade() replaces the colour; it is called if
-// has_shade() is true. The kernel applies the factors of instances afterwards.
+// has_shade() is true. The kernel then applies the factors of instances.
 
 #include "base/launch.cuh"
 #include "project/project_cuda.h"
@@ -26,8 +26,8 @@ struct ItemTables {
     SlopeLimits<float> limits;  // limits of the image's camera
 };
 
-// Returns the image's camera as a model: a pinhole if all images have pinholes, else
-// Intrinsics.
+// Returns the camera of the image as a model. It is a pinhole camera if all images have
+// one, and otherwise Intrinsics.
 template <class C, class Model>
 __device__ const C& camera_as(const ItemTables<Model>& in) {
     return in.image.camera;
@@ -37,8 +37,8 @@ __device__ inline float4 load4(const float* rows, uint32_t row) {
     return __ldg(reinterpret_cast<const float4*>(rows) + row);
 }
 
-// Sets `color` for the view direction. sh(k) returns the k-th coefficient (see
-// color_of_coefficients()).
+// Computes `color` for the view direction. sh(k) returns the k-th coefficient, as in
+// color_of_coefficients().
 template <int kDegree, class Coefficient>
 __device__ void color_of(const Coefficient& sh, const float mean[3], const ModelView<float>& view,
                          float color[3]) {
@@ -47,8 +47,8 @@ __device__ void color_of(const Coefficient& sh, const float mean[3], const Model
     color_of_coefficients(kDegree, direction, sh, color);
 }
 
-// Like color_of(), for coefficients in memory. Each coefficient is loaded where it is
-// used, because registers cannot hold all of them.
+// Like color_of(), but for coefficients in memory. Each coefficient is loaded just
+// before its use, because registers cannot hold all of them.
 template <int kDegree>
 __device__ void color_of_row(const float* row, const float mean[3], const ModelView<float>& view,
                              float color[3]) {
@@ -67,7 +67,7 @@ template <class RowModel>
 struct OfRows {
     using Model = RowModel;
     using Fetched = float4;
-    struct Place {};  // rows are addressed directly
+    struct Place {};  // not needed, because rows are addressed directly
     static constexpr bool kFades = false;
     static constexpr bool kTints = false;
     static constexpr bool kPlaces = false;
@@ -129,7 +129,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
     }
 };
 
-// Reads packed gaussians, the fastest source.
+// Reads packed gaussians. This is the fastest source.
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
     static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
@@ -173,7 +173,7 @@ struct CodeSource {
         // Cluster of the current row, and the end of that cluster's rows.
         uint32_t cluster, end;
     };
-    // The values that depend only on the code of the opacity, for a table.
+    // Values that only depend on the code of the opacity. They are stored in a table.
     struct OpacityEntry {
         float reach_in_sigmas, log2_opacity;
     };
@@ -205,8 +205,8 @@ struct CodeSource {
         const uint32_t cluster = in.item.cluster + __popc(__ballot_sync(kAllLanes, is_before));
         return {cluster, static_cast<uint32_t>(__ldg(offset.data + cluster + 1))};
     }
-    // Moves the place forward to the cluster of row g. Rows must not decrease from call
-    // to call.
+    // Advances the place to the cluster of row g. Rows must not decrease from call to
+    // call.
     static __device__ void advance(const Model& m, Place& place, uint32_t g) {
         while (g >= place.end)
             place.end = static_cast<uint32_t>(__ldg(m.codes.offset.data + ++place.cluster + 1));

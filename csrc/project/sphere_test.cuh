@@ -1,8 +1,8 @@
 #pragma once
 
-// Tests before projection that find gaussians, or rows of pixels, without any pixel
-// centre to draw. The tests only save work: whatever they discard, the blend step would
-// discard as well.
+// Tests that are run before projection. They find gaussians, or rows of pixels, for
+// which no pixel centre is drawn. They only save work: the blend step would discard
+// everything that they discard.
 
 #include "project/project_math.h"
 #include "project/sources.cuh"
@@ -17,8 +17,9 @@ struct SphereTest {
     float half;           // upper bound on the half extent, px
 };
 
-// Tests a gaussian at p in view space. `is_faint`: its instance has an opacity below 1.
-// The function has no branches, because the lanes of a warp would diverge.
+// Tests a gaussian at p in view space. `is_faint` is true if its instance has an
+// opacity below 1. The function has no branches, because the lanes of a warp would
+// diverge.
 template <class Source, class C>
 __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3],
                                   float reach, float reach_scale, bool is_faint) {
@@ -30,7 +31,7 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
     const bool is_outside = !(cam.depth_of(p) >= cam.near_depth) | (reach < 0) |
                             (from_x - half >= middle_x) | (from_y - half >= middle_y);
     // A gaussian whose centre is in the image is in the frustum, unless antialiasing, a
-    // fade or its instance makes it too faint to draw.
+    // fade or its instance makes it too faint to be drawn.
     const bool is_faded = (Source::kFades && in.item.weight < 1) || is_faint;
     const bool is_inside =
         (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased & !is_faded;
@@ -40,7 +41,8 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
 }
 
 // Removes the first and the last row from a pixel box if the ellipse reaches no pixel
-// centre in that row. A margin covers rounding, so that only the blend step decides.
+// centre in that row. A margin accounts for rounding, so that only the blend step
+// decides about a pixel.
 template <class C>
 __device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float, C>& s,
                                  float image_width, PixelBox<int>& box) {
@@ -50,7 +52,7 @@ __device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float
     const auto misses = [&](int row) {
         const float dy = static_cast<float>(row) + 0.5f - e.v;
         // In this row of pixels, alpha is largest at x = `middle`. Rounding gives the
-        // nearest pixel centre, which may be outside of the image.
+        // nearest pixel centre, which may be outside the image.
         const float middle = slope * dy + u;
         const float t1 = e.l11 * fmaxf(fabsf(middle - round_of(middle)) - margin, 0.0f),
                     t2 = e.l22 * dy;

@@ -11,15 +11,16 @@ namespace v3dg {
 namespace cuda {
 
 constexpr unsigned kWarps = 8;
-constexpr unsigned kQueue = 64;  // up to 31 gaussians remain queued when 32 are added
-// Up to 31 large records remain queued when 32 are added.
+constexpr unsigned kQueue = 64;  // at most 31 gaussians are in the queue when 32 are
+                                 // added
+// At most 31 large records are in the queue when 32 are added.
 constexpr unsigned kMostWaiting = 64;
 
 // A gaussian in the queue of a warp.
 struct Queued {
     float p[3];  // view space
-    // Index of the gaussian in the item. In a shared item: 32 times the index, plus the
-    // index of the placement among the sharers.
+    // Index of the gaussian in the item. In a shared item, it is 32 times that index,
+    // plus the index of the placement among the sharers.
     uint32_t place;
 };
 
@@ -30,7 +31,8 @@ struct WarpSpace {
     // The ellipses of up to 32 records. Each lane writes one; then the warp copies them
     // to global memory with coalesced stores.
     float4 ellipses[kEllipseVectors * 32];
-    // The queue of large records: pixel boxes, and indices among the item's records.
+    // The queue of large records: their pixel boxes, and their indices among the item's
+    // records.
     RecordBox boxes[kMostWaiting];
     uint8_t large[kMostWaiting];
     unsigned num_large;
@@ -66,8 +68,8 @@ struct Loaded {
 };
 
 // Stores the tables of an item in shared memory. Lane i passes the i-th 32-bit word of
-// the item and of the placement. The image and the model are loaded only if they differ
-// from the image and the model of the previous item.
+// the item and of the placement. The image and the model are only loaded if they differ
+// from those of the previous item.
 template <class Model>
 __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint32_t placement_word,
                              const ProjectInput& in, const Model* models, Loaded& loaded) {

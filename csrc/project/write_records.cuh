@@ -13,14 +13,14 @@ namespace cuda {
 
 // Properties of an item's gaussians.
 struct ItemTraits {
-    bool are_small;   // the gaussians are small on the image, judged by the first 32
-    bool have_shade;  // shade() sets the final colour
+    bool are_small;   // whether the first 32 gaussians are small on the image
+    bool have_shade;  // whether shade() sets the final colour
 };
 
 // Computes the record of gaussian g, whose mean is p in view space, and its pixel
 // `box`. Returns whether the gaussian reaches a pixel centre. Unless traits.are_small,
-// the result is also true for a few gaussians that reach none. There is no early
-// return, not even if the lane has no gaussian (!is_one), because all lanes of a warp
+// it also returns true for a few gaussians that reach none. The function never returns
+// early, even if the lane has no gaussian (!is_one), because all lanes of a warp must
 // stay together.
 template <class Source, class C>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in,
@@ -34,7 +34,8 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
     if constexpr (Source::kTints) fade(factors->opacity, e);
     float half_x, half_y;
     const C& cam = camera_as<C>(in);
-    // Pass 1 as opacity: the sphere test has removed gaussians that are too faint.
+    // The sphere test has removed gaussians that are too faint, so pass an opacity of
+    // 1.
     bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
     is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
     num_in_frustum += is_in_frustum;
@@ -48,10 +49,11 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
     return reaches_pixel;
 }
 
-// Writes the records of the lanes' gaussians from index `first` on, in lane order, and
-// adds them to the counts of tiles. Returns the number of records. `sharers` are the
-// placements of a shared item. `factors` points to the factors of the sharers or, if
-// the item is not shared, of its placement. It is null if the source has no factors.
+// Writes the records of the lanes' gaussians, in lane order, beginning at index
+// `first`. Adds them to the counts of tiles, and returns the number of records.
+// `sharers` are the placements of a shared item. `factors` points to the factors of the
+// sharers or, if the item is not shared, of its placement. It is null if the source
+// does not use factors.
 template <class Source, bool kIsShared, class C>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
                                   const Placement* sharers, const InstanceFactors* factors,

@@ -1,5 +1,5 @@
 // Computes codebooks by Lloyd's algorithm, starting from the density of the values.
-// Computes palettes by repeatedly cutting sets of vectors in two.
+// Computes palettes by repeatedly dividing sets of vectors in two.
 
 #include "quantize/codebook.h"
 
@@ -15,8 +15,8 @@ namespace {
 
 constexpr size_t kBins = 4096;
 constexpr int kRounds = 16;
-// The share of a table's entries that are evenly distributed over the range, so that
-// rare values have a close entry.
+// The fraction of a table's entries that are evenly distributed over the range, so that
+// a rare value also has a close entry.
 constexpr double kEven = 0.25;
 
 // Initialises a table. The density of entries is proportional to the cube root of the
@@ -28,7 +28,7 @@ void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
         density[std::min(static_cast<size_t>((value - low) / width), kBins - 1)] += 1.0;
     for (double& count : density) count = std::cbrt(count);
     const double total = std::accumulate(density.begin(), density.end(), 0.0);
-    double before = 0.0;  // share of the entries below a bin
+    double before = 0.0;  // fraction of the entries below a bin
     size_t entry = 0;
     for (size_t bin = 0; bin < kBins; ++bin) {
         const double share = (1 - kEven) * density[bin] / total + kEven / kBins;
@@ -41,11 +41,11 @@ void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     }
 }
 
-// A range of rows, which one vector represents.
+// A range of rows that one vector represents.
 struct Part {
     size_t first, last;
     double error;  // sum of squared distances to the mean
-    size_t axis;   // axis with the largest part of the error
+    size_t axis;   // axis that contributes most to the error
     uint32_t number;
     std::vector<double> mean;
 
@@ -122,7 +122,8 @@ VectorPalette make_palette(Span<const float> vectors, size_t width, size_t size)
         auto middle = std::stable_partition(first, last, [&](uint32_t row) {
             return vectors[row * width + part.axis] <= part.mean[part.axis];
         });
-        if (middle == first || middle == last)  // the differences vanish in rounding
+        if (middle == first || middle == last)  // rounding hides the differences
+                                                // between the vectors
             middle = first + (part.last - part.first) / 2;
         const auto cut = static_cast<size_t>(middle - order.begin());
         parts.push(part_of(vectors, width, order, part.first, cut, ++number));

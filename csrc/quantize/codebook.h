@@ -1,7 +1,7 @@
 #pragma once
 
-// Codebooks: few numbers that represent many. Palettes: few vectors that represent
-// many.
+// Codebooks represent many numbers by a few, and palettes represent many vectors by a
+// few.
 
 #include <cstdint>
 #include <vector>
@@ -12,9 +12,9 @@ namespace v3dg {
 
 constexpr size_t kCodebookSize = 256;
 
-// Fills a table of kCodebookSize ascending numbers that represent the values, by
+// Fills a table with kCodebookSize ascending numbers that represent the values, by
 // Lloyd's algorithm. If there are at most kCodebookSize different values, the table has
-// each of them, and repeats the largest at the end.
+// each of them, and repeats the largest one at the end.
 void make_codebook(Span<const double> values, Span<double> table);
 
 // K vectors of some width that represent N vectors.
@@ -25,9 +25,9 @@ struct VectorPalette {
 };
 
 // Computes a palette of 1 to `size` vectors. Repeatedly, the set of vectors with the
-// largest squared error is cut in two, at its mean along its widest axis, until there
-// are enough sets or all errors are 0. This takes O(N width log K) steps, without
-// searches for nearest neighbours, and is deterministic.
+// largest squared error is divided in two, at its mean along its widest axis, until
+// there are enough sets or all errors are 0. This takes O(N width log K) steps, needs
+// no search for nearest neighbours, and is deterministic.
 VectorPalette make_palette(Span<const float> vectors, size_t width, size_t size);
 
 }  // namespace v3dg

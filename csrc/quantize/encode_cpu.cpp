@@ -1,5 +1,5 @@
-// Encodes pages. A thread processes one cluster at a time: first its ranges, then the
-// codes of its gaussians.
+// Encodes pages. Each thread processes one cluster at a time: first its ranges, then
+// the codes of its gaussians.
 
 #include <algorithm>
 #include <stdexcept>
@@ -17,7 +17,8 @@ namespace {
 constexpr size_t kClustersAtOnce = 16;
 constexpr double kMostPosition = 0x1p126, kMostColorValue = 32768, kMostShValue = 1024;
 
-// The 24 rotations that map a cube onto itself: quaternions w, x, y, z, not normalised.
+// The 24 rotations that map a cube onto itself, as quaternions w, x, y, z of any
+// length.
 constexpr int8_t kCubeRotations[24][4] = {
     {1, 0, 0, 0},  {0, 1, 0, 0},   {0, 0, 1, 0},  {0, 0, 0, 1},   {1, 1, 1, 1},   {1, 1, 1, -1},
     {1, 1, -1, 1}, {1, 1, -1, -1}, {1, -1, 1, 1}, {1, -1, 1, -1}, {1, -1, -1, 1}, {1, -1, -1, -1},
@@ -52,7 +53,7 @@ uint16_t half_of(double x, double (*round)(double)) {
 }
 
 // Converts a step to a half, in units of kStepUnit. A step below the smallest normal
-// half becomes 0, because ranges that small are invisible.
+// half becomes 0, because differences in a range that small are invisible.
 uint16_t step_half(double step, double (*round)(double)) {
     return step < kStepUnit * 0x1p-14 ? uint16_t(0) : half_of(step / kStepUnit, round);
 }
@@ -70,8 +71,8 @@ void check_is_finite(const GaussianRows<const float>& in, size_t row) {
 }
 
 // Sets the scales, as bits of floats, and x, y, z of the quaternion. If the quaternion
-// cannot be coded, the axes are permuted. Axes that can be coded are kept, so that
-// encoding a decoded gaussian gives the same codes.
+// cannot be coded, the axes are permuted. They are not permuted if it can be coded, so
+// that encoding a decoded gaussian gives the same codes.
 void prepare_shape(const float* quat, const float* scale, Prepared& out) {
     double length2 = 0, q[4] = {1, 0, 0, 0};
     for (int k = 0; k < 4; ++k) length2 += double(quat[k]) * quat[k];
@@ -133,13 +134,13 @@ struct Range {
 
 // Returns the step of a range of float32 numbers that are coded as first + code * step,
 // with code <= most. It exceeds the exact step by at most the rounding error of the
-// last number. So decoded gaussians lead to the same step.
+// last number. Therefore decoded gaussians give the same step.
 double step_of(const Range& range, double first, uint32_t most) {
     return (range.last - first + float_spacing(range.magnitude()) / 2) / most;
 }
 
 // Returns the ranges of a cluster, rounded inwards to values that a ClusterCode can
-// store. So the first and the last code of each range occur.
+// store. Therefore the first and the last code of each range occur.
 ClusterCode ranges_of(const std::vector<Prepared>& cluster) {
     Range mean[3], color[3];
     uint32_t least = ~0u, most = 0;
@@ -209,10 +210,10 @@ int most_sh_code(int sh_degree, int basis, int channel) {
     return (1 << (sh_bits(sh_degree, basis, channel) - 1)) - 1;
 }
 
-// Computes the step of each band and channel as a half: the largest value divided by
-// the square of the largest code. A channel with values below 2^-11 of the brightness
-// is dropped. Such values are less than the smallest step of the brightness, and would
-// be lost when converting to red, green and blue in float32.
+// Computes the step of each band and channel as a half. It is the largest value divided
+// by the square of the largest code. A channel with values below 2^-11 of the
+// brightness is dropped: such values are less than the smallest step of the brightness,
+// and would be lost when converting to red, green and blue in float32.
 void sh_steps_of(const GaussianRows<const float>& in, uint16_t* steps) {
     const int num_bases = num_sh_bases(in.sh_degree);
     double most[9] = {};

@@ -13,9 +13,9 @@
 
 namespace v3dg {
 
-// A coded page of K clusters. It consists of one record per gaussian, then the codes of
-// the SH coefficients above degree 0, then the ranges of the clusters. T is const if
-// the page is only read.
+// A coded page of K clusters. It has one record per gaussian, then the codes of the SH
+// coefficients above degree 0, then the ranges of the clusters. T is const if the page
+// is only read.
 template <class T>
 struct PageCodes {
     Span<const int64_t> offset;  // [K + 1] first row of each cluster, ascending
@@ -50,12 +50,12 @@ V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words,
     out.opacities[row] = g.opacity;
 }
 
-// The coded pages of a bundle on the host, in the layout of its file. It borrows the
+// The coded pages of a bundle on the host, in the layout of its file. It points to the
 // codes and offsets, and owns the ranges.
 class CodedPages {
   public:
-    // `words` are all P pages, first_cluster is [P + 1], offset is [C + 1]. Throws
-    // std::invalid_argument, which names the cluster, unless all ranges are valid.
+    // `words` has all P pages; first_cluster is [P + 1], and offset is [C + 1]. Throws
+    // std::invalid_argument if ranges are invalid; the message names the cluster.
     CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
                int sh_degree);
     const Codes& codes() const { return codes_; }
@@ -71,11 +71,11 @@ class CodedPages {
 // The memory of a pool that keeps codes. Frames read it like the codes of a single
 // bundle. It is divided into slots of equal size, each for one page. The rows of all
 // slots are contiguous, and so are their clusters. The ranges of a cluster contain the
-// location of its codes. So no other code needs to know in which slot a page is.
+// location of its codes, so other code need not look up which slot a page is in.
 struct CodeSlots {
     uint32_t *records, *sh;
     unsigned char* ranges;
-    int64_t* offset;  // see Codes::offset; stays ascending when a slot is written
+    int64_t* offset;  // as in Codes::offset; stays ascending when a slot is written
     uint32_t range_size, sh_stride;
     size_t num_clusters;
 
@@ -91,7 +91,7 @@ struct CodeSlots {
     }
 };
 
-// The bytes of a slot per row, and per cluster.
+// Number of bytes in a slot per row, and per cluster.
 constexpr size_t slot_row_bytes(int sh_degree) {
     return 4 * (kRecordWords + num_sh_words(sh_degree));
 }
@@ -103,7 +103,7 @@ constexpr size_t slot_cluster_bytes(int sh_degree) {
 struct SlotPage {
     PageCodes<const uint32_t> page;
     size_t row, cluster;  // first row and cluster of the slot
-    // Number of clusters of the page. The remaining clusters of the slot become empty.
+    // Number of clusters of the page. All other clusters of the slot become empty.
     size_t num_clusters;
 };
 
@@ -124,7 +124,7 @@ V3DG_HD inline void write_cluster(const SlotPage& from, size_t k, const CodeSlot
                 range_bytes(page.sh_degree));
 }
 
-// Clusters to decode, in any order, and where their gaussians are written.
+// Clusters to decode, in any order, and the rows to write their gaussians to.
 struct DecodeInput {
     Codes codes;
     Span<const int32_t> cluster;  // [S]
@@ -136,29 +136,29 @@ namespace cpu {
 // Encodes gaussians, rounded to the steps of their cluster's ranges. Gaussians that
 // were decoded from a page give the same page again. A scale of 0 becomes 2^-14 of the
 // gaussian's largest scale. Scales are clamped to [2^-64, 2^64], means to 2^126,
-// colours to 32,768, other SH coefficients to 1,024, opacities to [0, 1]. Throws
+// colours to 32,768, other SH coefficients to 1,024, and opacities to [0, 1]. Throws
 // std::invalid_argument if a value is not finite.
 void encode_page(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page);
 
-// Decodes the gaussians of a page. Throws std::invalid_argument, which names the
-// cluster, unless all ranges are valid.
+// Decodes the gaussians of a page. Throws std::invalid_argument if ranges are invalid;
+// the message names the cluster.
 void decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out);
 
 // Decodes the gaussians of clusters.
 void decode(const DecodeInput& in, const GaussianRows<float>& out);
 
-// Writes a page to its slot. The ranges of the page must be valid.
+// Writes a page to its slot. Precondition: the ranges of the page are valid.
 void write_slot(const SlotPage& from, const CodeSlots& to);
 }  // namespace cpu
 
-// Like cpu::decode(), with the same bits. The codes and `out` are on the device, all
-// other arrays in host memory. Work is enqueued on the stream. Throws
+// Like cpu::decode(), with the same bits. The codes and `out` are on the device, and
+// all other arrays in host memory. The work is enqueued on the stream. Throws
 // std::runtime_error if CUDA reports an error.
 namespace cuda {
 void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream);
 
-// Like cpu::write_slot(), for several pages. `pages` must be readable by the device;
-// the memory of the pages and the slots is on the device.
+// Like cpu::write_slot(), for several pages. The device must be able to read `pages`.
+// The memory of the pages and the slots is on the device.
 void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream);
 }  // namespace cuda
 

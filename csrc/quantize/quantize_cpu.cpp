@@ -23,8 +23,8 @@ CodedRanges ranges_at(const uint32_t* words, int sh_degree) {
     return out;
 }
 
-// Returns the ranges of a cluster. Throws std::invalid_argument, which names the
-// cluster, if they are not valid.
+// Returns the ranges of a cluster. Throws std::invalid_argument if they are invalid;
+// the message names the cluster.
 ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster,
                            const char* whose) {
     const CodedRanges coded = ranges_at(words, sh_degree);

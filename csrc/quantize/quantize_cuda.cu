@@ -29,7 +29,7 @@ __global__ void decode_kernel(DecodeInput in, GaussianRows<float> out) {
     decode_row(in.codes.record_of(ranges, from), in.codes.sh_of(ranges, from), ranges, out, row);
 }
 
-// One block per page.
+// Launched with one block per page.
 __global__ void write_slots_kernel(const SlotPage* pages, CodeSlots to) {
     const SlotPage from = pages[blockIdx.x];
     const size_t first = from.page.first_row(), count = from.page.end_row() - first;

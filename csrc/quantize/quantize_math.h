@@ -6,7 +6,7 @@
 //
 // Decoding gives the same bits on every device and instruction set, with or without
 // floating-point contraction. A step has so few bits that its product with a code is
-// exact in float32; so only the sum is rounded.
+// exact in float32, so only the sum is rounded.
 
 #include "base/span.h"
 #include "math/gaussian.h"
@@ -14,22 +14,23 @@
 namespace v3dg {
 
 constexpr int kRecordWords = 4;
-constexpr int kPageAlignment = 16;  // bytes; a record is loaded with one instruction
+constexpr int kPageAlignment = 16;  // bytes; allows loading a record with one
+                                    // instruction
 
 constexpr uint32_t kMostMean = 4095, kMostScale = 1023, kMostColor = 511, kMostOpacity = 255;
 // The code of a rotation. The rotation is multiplied by one of the 24 rotations of a
-// cube, such that w becomes the largest component. The other components are then at
-// most sin(22.5 degrees), which are 255 steps. A coded quaternion has the length
+// cube, chosen such that w is the largest component. The other components are then at
+// most sin(22.5 degrees), which is 255 steps. A coded quaternion has the length
 // sqrt(kQuatLength2).
 constexpr int32_t kZeroQuat = 255, kQuatLength2 = 444016;
 constexpr float kQuatStep = 0.0015007235f;  // 1 / sqrt(kQuatLength2)
 constexpr float kOpacityStep = 1.0f / 255;
-// The codes of scales, from 2^-64 to 2^64. A code represents bits of the float, which
-// grow approximately like its logarithm.
+// Limits for the codes of scales, from 2^-64 to 2^64. A code consists of bits of the
+// float, which grow approximately like its logarithm.
 constexpr uint32_t kLeastScaleBits = 63u << 23, kMostScaleBits = (191u << 23) - 1;
 constexpr int kScaleFirstShift = 14, kScaleStepShift = 4;
-// The unit of the steps of colours. With it, the steps of small ranges are normal
-// numbers in 16 bits.
+// The unit of the steps of colours. With this unit, the steps of small ranges are
+// normal half floats.
 constexpr float kStepUnit = 0.00390625f;  // 2^-8
 
 // The ranges of a cluster, as stored in a page. A half is a float16.
@@ -41,17 +42,17 @@ struct ClusterCode {
 };
 static_assert(sizeof(ClusterCode) == 40, "the file format fixes the size of ClusterCode");
 
-// Returns the bytes of a cluster's ranges: a ClusterCode, then three halves per SH band
-// above degree 0.
+// Returns the number of bytes of a cluster's ranges: a ClusterCode, then three halves
+// per SH band above degree 0.
 V3DG_HD constexpr int cluster_code_bytes(int sh_degree) {
     return static_cast<int>(sizeof(ClusterCode)) + (6 * sh_degree + 3) / 4 * 4;
 }
 
-// Returns the 32-bit words per gaussian for SH coefficients above degree 0.
+// Returns the number of 32-bit words per gaussian for SH coefficients above degree 0.
 V3DG_HD constexpr int num_sh_words(int sh_degree) { return 2 * sh_degree; }
 
-// Returns the bits of one channel of an SH coefficient: 0 brightness, 1 orange, 2
-// green.
+// Returns the number of bits for one channel (0 brightness, 1 orange, 2 green) of an SH
+// coefficient.
 V3DG_HD constexpr int sh_bits(int sh_degree, int basis, int channel) {
     return sh_degree == 1   ? 7
            : sh_degree == 2 ? (channel == 0 ? 7 : 6 - channel)
@@ -60,8 +61,8 @@ V3DG_HD constexpr int sh_bits(int sh_degree, int basis, int channel) {
 }
 V3DG_HD constexpr int band_of(int basis) { return basis < 4 ? 1 : basis < 9 ? 2 : 3; }
 
-// Returns the bytes of a page: records of gaussians, codes of their SH coefficients,
-// and ranges of clusters, padded to a multiple of 16.
+// Returns the number of bytes of a page. It has the records of gaussians, the codes of
+// their SH coefficients, and the ranges of clusters, padded to a multiple of 16.
 V3DG_HD constexpr size_t page_bytes(size_t num_gaussians, size_t num_clusters, int sh_degree) {
     return (4 * (kRecordWords + num_sh_words(sh_degree)) * num_gaussians +
             cluster_code_bytes(sh_degree) * num_clusters + kPageAlignment - 1) /
@@ -77,15 +78,15 @@ V3DG_HD inline float float_of_half(uint32_t half) {
     return half & 0x8000 ? -size : size;
 }
 
-// The ranges of a cluster in the form that decoding uses, and where its codes are. In a
-// table of ranges, an element has range_bytes() bytes.
+// The ranges of a cluster in the form that decoding uses, and the location of its
+// codes. An element of a table of ranges has range_bytes() bytes.
 struct alignas(16) ClusterRanges {
     float mean_first[3];
     uint32_t scale_first;
     float mean_step[3];
     uint32_t scale_step;
     float color_first[3], color_step[3];
-    uint32_t record_base, sh_base;  // see Codes
+    uint32_t record_base, sh_base;  // explained at Codes
     float sh_step[9];               // [band][channel]
 };
 V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degree + 3) / 4 * 16; }
@@ -93,9 +94,9 @@ static_assert(range_bytes(3) == sizeof(ClusterRanges),
               "the largest degree must use the whole struct");
 
 // The gaussians of a bundle as codes, on the host or on a device. Row r of cluster c
-// has four words of `records`, from index 4 (record_base + r) on. It has two words per
-// SH degree of `sh`, from index 2 (sh_base + sh_stride r) on. The sums in parentheses
-// are modulo 2^32.
+// has four words of `records`, beginning at index 4 (record_base + r). It has two words
+// of `sh` per SH degree, beginning at index 2 (sh_base + sh_stride r). The sums in
+// parentheses are modulo 2^32.
 struct Codes {
     const uint32_t *records, *sh;
     const unsigned char* ranges;  // [C] ClusterRanges, range_size bytes each
@@ -116,7 +117,7 @@ struct Codes {
     }
 };
 
-// Returns the ranges in the form that decoding uses. `sh_steps` are the halves that
+// Returns the ranges in the form that decoding uses. `sh_steps` has the halves that
 // follow the ClusterCode, three per band.
 V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* sh_steps,
                                        int sh_degree) {
@@ -142,7 +143,7 @@ V3DG_HD V3DG_INLINE V exact_sqrt(V x) {
 #endif
 }
 
-// Returns the bits [first, first + num_bits) of each lane's word as a number.
+// Returns bits [first, first + num_bits) of each lane's word as a number.
 template <class V>
 V3DG_HD V3DG_INLINE V number_at(Bits<V> word, int first, int num_bits) {
     return float_of_number<V>(word >> first & ((1u << num_bits) - 1));
@@ -175,7 +176,7 @@ V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const Cluste
     g.quat[3] = z * kQuatStep;
 }
 
-// Returns the bits [first, first + num_bits) of an array of words.
+// Returns bits [first, first + num_bits) of an array of words.
 template <class B>
 V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     const int word = first / 32, shift = first % 32;
@@ -184,9 +185,9 @@ V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     return bits & ((1u << num_bits) - 1);
 }
 
-// Decodes the SH coefficients above degree 0 of one gaussian, or of one per lane, three
-// channels each. A code is a signed number n that represents n |n| steps, so that small
-// values have a fine resolution.
+// Decodes the SH coefficients above degree 0 of one gaussian, or of one per lane, with
+// three channels each. A code is a signed number n that stands for n |n| steps, so that
+// small values have a fine resolution.
 template <class V>
 V3DG_HD V3DG_INLINE void decode_sh(const Bits<V>* words, const float* step, int sh_degree, V* sh) {
     int first = 0;

@@ -32,8 +32,7 @@ namespace cuda {
 
 struct RasterTape;  // defined in rasterize.h
 
-// The channels and the meshes of a frame's pictures, in device memory. The channel
-// `clipped` is not supported on CUDA.
+// The channels and the meshes of a frame's pictures, in device memory.
 struct FrameSensors {
     Sensor first;   // sensor of the first picture
     Sensor second;  // sensor of the second picture of a stereo pair
@@ -41,7 +40,10 @@ struct FrameSensors {
     // picture. 0 if there are at most two pictures, each with its own planes.
     size_t num_pixels = 0;
 
-    bool is_on() const { return first.is_on(); }
+    // Returns whether the sensor pass has anything to do. It does not set the channel
+    // `clipped` (draw/clipped.h).
+    bool is_on() const { return first.planes.wants_walk() || first.mesh.is_there(); }
+    bool wants_clipped() const { return first.planes.clipped != nullptr; }
     // Returns whether the channels need the normals and the instances of records.
     bool needs_normals() const { return first.planes.normal != nullptr; }
     bool needs_instances() const { return first.planes.wants_ids(); }

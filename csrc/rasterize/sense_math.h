@@ -230,20 +230,17 @@ V3DG_HD V3DG_INLINE void normal_of_gaussian(const float quat[4], const float sca
     normal_along(axis, view, p, normal);
 }
 
-// Like normal_of_gaussian(), but computes the normal from the factor F of a
-// PackedGaussian. If two axes are equally short, the normal is some vector in their
-// plane.
+// Sets the axes of a gaussian from the factor F of a PackedGaussian, divided by the
+// length of the longest axis, so that products of small scales do not underflow.
+// Returns that length.
 //
 // The first column of F is the longest axis, and the other two columns span the plane
 // of the other axes. They are rotated until they are orthogonal, which makes them axes;
-// this is one step of Jacobi's method for singular values. The normal is the cross
-// product of the two longest axes, which is exact even if the gaussian is flat.
-V3DG_HD V3DG_INLINE void normal_of_factor(const float f[8], const ModelView<float>& view,
-                                          const float p[3], float normal[3]) {
+// this is one step of Jacobi's method for singular values.
+V3DG_HD V3DG_INLINE float axes_of_factor(const float f[8], float longest[3], float middle[3],
+                                         float shortest[3]) {
     constexpr float kSmallest = 1e-30f;
-    // Lengths are divided by the longest axis, so that products of small scales do not
-    // underflow.
-    const float unit = 1 / max_of(sqrt_of(dot3(f, f)), kSmallest);
+    const float length = max_of(sqrt_of(dot3(f, f)), kSmallest), unit = 1 / length;
     const float one[3] = {unit * f[3], unit * f[4], unit * f[5]};
     const float other[3] = {0, unit * f[6], unit * f[7]};
     const float difference = dot3(one, one) - dot3(other, other);
@@ -255,60 +252,23 @@ V3DG_HD V3DG_INLINE void normal_of_factor(const float f[8], const ModelView<floa
     const float cosine2 = size > 0 ? difference / size : 1.0f;
     const float cosine = sqrt_of(max_of(0.5f + 0.5f * cosine2, 0.0f));
     const float sine = sqrt_of(max_of(0.5f - 0.5f * cosine2, 0.0f)) * (twice < 0 ? -1.0f : 1.0f);
-    float longest[3], middle[3], axis[3];
     for (int k = 0; k < 3; ++k) {
         longest[k] = unit * f[k];
         middle[k] = cosine * one[k] + sine * other[k];
+        shortest[k] = cosine * other[k] - sine * one[k];
     }
+    return length;
+}
+
+// Like normal_of_gaussian(), from the factor F of a PackedGaussian. If two axes are
+// equally short, the normal is any vector in their plane. The cross product of the two
+// longest axes is exact even if the gaussian is flat.
+V3DG_HD V3DG_INLINE void normal_of_factor(const float f[8], const ModelView<float>& view,
+                                          const float p[3], float normal[3]) {
+    float longest[3], middle[3], shortest[3], axis[3];
+    axes_of_factor(f, longest, middle, shortest);
     cross3(longest, middle, axis);
     normal_along(axis, view, p, normal);
-}
-
-// A gaussian that is not drawn because its mean is in front of the near plane, although
-// its body extends beyond that plane. The body is the region where the gaussian's alpha
-// in 3D is at least 1/255.
-struct ClippedBody {
-    double mean[3];     // in view space
-    double to_unit[9];  // row major; maps the body to a ball
-    double reach2;      // squared radius of the ball
-};
-
-// Sets a body. `axes` has the gaussian's axes in view space as columns of a row-major
-// matrix. Returns false if the body does not extend beyond the near plane.
-V3DG_HD V3DG_INLINE bool set_clipped_body(const double p[3], const double axes[9], double opacity,
-                                          double near_depth, ClippedBody& body) {
-    if (!(opacity >= kMinAlpha) || !(opacity <= 1)) return false;
-    body.reach2 = 2 * log(opacity / kMinAlpha);
-    double across = 0;
-    for (int k = 0; k < 3; ++k) {
-        body.mean[k] = p[k];
-        across += axes[6 + k] * axes[6 + k];
-        const double length2 =
-            axes[k] * axes[k] + axes[3 + k] * axes[3 + k] + axes[6 + k] * axes[6 + k];
-        if (!(length2 > 0)) return false;
-        for (int i = 0; i < 3; ++i) body.to_unit[3 * k + i] = axes[3 * i + k] / length2;
-    }
-    return p[2] < near_depth && p[2] + sqrt(body.reach2 * across) >= near_depth;
-}
-
-// Returns whether the part of a body beyond the near plane is hit by the ray from the
-// eye through (x, y, 1).
-V3DG_HD V3DG_INLINE bool meets_body(const ClippedBody& body, double x, double y,
-                                    double near_depth) {
-    double a[3], b[3], ab = 0, aa = 0;
-    for (int k = 0; k < 3; ++k) {
-        const double* row = body.to_unit + 3 * k;
-        a[k] = row[0] * x + row[1] * y + row[2];
-        b[k] = dot3(row, body.mean);
-        ab += a[k] * b[k];
-        aa += a[k] * a[k];
-    }
-    const double nearest = ab / aa;  // depth of the point on the ray that is closest to
-                                     // the ball's centre
-    const double depth = nearest > near_depth ? nearest : near_depth;
-    double distance2 = 0;
-    for (int k = 0; k < 3; ++k) distance2 += (depth * a[k] - b[k]) * (depth * a[k] - b[k]);
-    return distance2 <= body.reach2;
 }
 
 }  // namespace v3dg

@@ -1,7 +1,7 @@
 #pragma once
 
-// The tables of a bundle on a device. They stay there as long as a scene that uses them
-// is resident (v3dg/residency.py).
+// The tables of a bundle on a device. They are kept there while any resident scene uses
+// them (v3dg/residency.py).
 
 #include "base/device.h"
 #include "residency/cluster_bounds.h"
@@ -15,8 +15,8 @@ struct BundleOnDevice {
     ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
     // One byte per ClusterBounds. Bit k is set if cluster k of the bounds can be drawn
-    // together with the preceding cluster, because their rows are adjacent and their
-    // appearance is equal.
+    // together with the cluster before it. This requires adjacent rows and an equal
+    // appearance.
     const uint8_t* joins;
     ClusterRuns runs;
 };
@@ -26,11 +26,11 @@ std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
                                        const ClusterAppearance& appearance);
 
 // The tables of one bundle, on the device that is current at construction. They are
-// immutable, so all scenes, threads and streams of the device share them. The owner
+// immutable, so all scenes, threads and streams of the device can share them. The owner
 // must keep them alive until all work that reads them is done.
 class BundleTables {
   public:
-    // Returns when the tables are on the device. The caller may then reuse host memory.
+    // Copies the tables to the device before it returns.
     BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                  cudaStream_t stream);
     BundleTables(const BundleTables&) = delete;

@@ -1,4 +1,4 @@
-// Computes the bounds of every kClustersOfBounds clusters, and of runs of clusters.
+// Computes bounds of each kClustersOfBounds clusters, and of runs of clusters.
 
 #include "residency/cluster_bounds.h"
 
@@ -11,12 +11,12 @@ namespace v3dg {
 
 namespace {
 
-// The smallest radius for which runs are tested. Its square is far above the range
-// where float32 loses precision.
+// Runs are tested only if radii are at least this large. The square of this value is
+// far above the range in which float32 loses precision.
 constexpr float kLeastRunRadius = 1e-15f;
 
-// Returns a ball that contains the centres of the balls. Without balls, it is at the
-// origin.
+// Returns a ball that contains the centres of the balls. If there are no balls, the
+// result is at the origin.
 Ball ball_of_centers(Span<const Ball> balls) {
     double middle[3] = {0, 0, 0}, radius2 = 0;
     for (const Ball& b : balls) {
@@ -85,7 +85,7 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
 ClusterRuns runs_of_clusters(const ClusterTable& table) {
     const size_t count = table.num_clusters();
     ClusterRuns runs{};
-    // Ends of the runs, in units of kClustersOfBounds clusters; last run first.
+    // Ends of the runs, last run first, in units of kClustersOfBounds clusters.
     std::vector<size_t> ends;
     size_t left = (count + kClustersOfBounds - 1) / kClustersOfBounds;
     for (size_t size = 1; left > 0; size *= ends.size() > 1 ? 2 : 1) {

@@ -15,18 +15,20 @@ constexpr int32_t kShared = -1;  // value for an instance that all cameras see
 constexpr int32_t kMostEnvironment = (1 << 24) - 1;
 constexpr int32_t kSeesAll = -2;  // value for a camera that sees all instances
 
-// The instances that a camera sees have slots. First come the shared instances, then
-// the instances of the camera's environment, each in ascending order. For a camera that
-// sees all instances, instance i has slot i. There are I instances and E environments.
+// Numbers the instances that a camera sees: each has a slot. The shared instances come
+// first, then those of the camera's environment, both in ascending order. For a camera
+// that sees all instances, instance i has slot i. There are I instances and E
+// environments.
 struct EnvironmentTable {
     // [I] the shared instances, then the instances of each environment
     Span<const int32_t> order;
-    // [E + 1] first index in `order` of each environment, and the end
+    // [E + 1] the index in `order` at which each environment begins; the last element
+    // is the end
     Span<const int32_t> begin;
 
     V3DG_HD int32_t num_environments() const { return static_cast<int32_t>(begin.size) - 1; }
-    // Returns whether a camera may have the value `environment`: an environment of the
-    // scene, kShared for only the shared instances, or kSeesAll.
+    // Returns whether a camera may have the value `environment`. Valid values are the
+    // environments of the scene, kShared (only the shared instances) and kSeesAll.
     V3DG_HD bool has(int32_t environment) const {
         return environment >= kSeesAll && environment < num_environments();
     }
@@ -44,7 +46,7 @@ struct EnvironmentTable {
 // An EnvironmentTable on the host.
 class Environments {
   public:
-    // `environment` has the environment of each instance, at least kShared.
+    // `environment` has the environment of each instance, or kShared.
     explicit Environments(Span<const int32_t> environment) : order_(environment.size) {
         int32_t count = 0;
         for (const int32_t e : environment) count = std::max(count, e + 1);

@@ -1,7 +1,7 @@
 #pragma once
 
-// The slots of a page pool on the host. They have either rows, in planes that all
-// bundles of the pool share, or codes.
+// The slots of a page pool on the host. They hold either codes, or rows in planes that
+// all bundles of the pool share.
 
 #include <memory>
 #include <vector>
@@ -18,8 +18,8 @@ class HostPages {
 
     // Copies arriving pages to their slots.
     void apply(const PagePool& pool, const std::vector<PageChange>& changes);
-    // Return the gaussians of a bundle, as planes or as codes. Depending on
-    // PagePool::keeps_codes(), one of the two is null.
+    // Return the gaussians of a bundle. One of planes() and codes() is null, depending
+    // on PagePool::keeps_codes().
     const GaussianPlanes<float>* planes(size_t bundle) const {
         return planes_.empty() ? nullptr : &planes_[bundle];
     }
@@ -32,14 +32,14 @@ class HostPages {
 
     Buffer<float> storage_;
     size_t stride_ = 0;  // length of a plane
-    // One per bundle: SH degrees may differ.
+    // One element per bundle, because SH degrees may differ.
     std::vector<GaussianPlanes<float>> planes_;
 
     Buffer<uint32_t> records_, sh_;
     Buffer<unsigned char> ranges_;
     std::vector<int64_t> offset_;
     CodeSlots slots_{};
-    std::vector<Codes> codes_;  // one per bundle: SH degrees may differ
+    std::vector<Codes> codes_;  // one element per bundle, because SH degrees may differ
 };
 
 // Memory for the blocks of a pool on the host.

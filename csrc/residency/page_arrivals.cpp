@@ -4,7 +4,7 @@
 
 namespace v3dg {
 
-// The value of begins_[page] for an evicted page, which may still be in the list of
+// The value of begins_[page] for an evicted page that may still be in the list of
 // waiting pages.
 constexpr int32_t kHasLeft = kNeverBegins - 1;
 
@@ -31,7 +31,7 @@ void PageArrivals::advance(const std::vector<PageChange>& changes, Arrive arrive
     size_t num_kept = 0;
     for (size_t i = 0; i < waiting_.size(); ++i) {
         const auto [page, above] = waiting_[i];
-        // Skip the page if it was evicted, or if it arrived again and has begun to fade
+        // Skip the page if it was evicted, or if it arrived again and is already fading
         // in.
         if (begins_[page] != kNeverBegins) continue;
         const bool is_next = frame_ - begins_[above] >= kArrivalFrames;

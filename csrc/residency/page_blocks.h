@@ -1,7 +1,7 @@
 #pragma once
 
-// Blocks of host memory. A block holds a page after it was read, until it is copied to
-// its slot. Blocks have a few different sizes, so that little memory is unused.
+// Blocks of host memory. A block holds a page from the time it is read until it is
+// copied to its slot. To waste little memory, blocks have a few different sizes.
 
 #include <algorithm>
 #include <cstddef>
@@ -12,15 +12,15 @@ namespace v3dg {
 // Allocates memory for blocks. The kind of memory depends on the device.
 struct BlockMemory {
     virtual ~BlockMemory() = default;
-    // The memory is freed with this object.
+    // The memory is freed when this object is destroyed.
     virtual unsigned char* allocate(size_t bytes) = 0;
 };
 
 class PageBlocks {
   public:
     // Allocates blocks of about `num_bytes` in total, but at most `most_blocks` blocks.
-    // Their sizes are distributed like the page sizes in `samples`. Also allocates four
-    // blocks for the largest page.
+    // Their sizes are distributed like the page sizes in `samples`. Four more blocks
+    // are allocated for the largest page.
     void allocate(const std::vector<size_t>& samples, size_t most_page_bytes, size_t num_bytes,
                   size_t most_blocks, BlockMemory& memory) {
         constexpr size_t kNumSizes = 8, kLeast = 64;

@@ -1,6 +1,6 @@
 // Implements the decisions of page_policy.h. note() marks resident pages as used, and
-// collects absent pages. choose() orders the absent pages for reading. bring() assigns
-// slots to pages that were read, and evicts the pages that were unused for longest.
+// collects absent pages. choose() sorts the absent pages for reading. bring() assigns
+// slots to pages that were read, and evicts the least recently used pages.
 
 #include "residency/page_policy.h"
 
@@ -19,34 +19,36 @@ namespace {
 
 // The priority of a page is at least kAbove times the priority of each page below it.
 constexpr float kAbove = 2.0f;
-// The largest priority. Priorities near the eye are unbounded; they are clamped, so
-// that a page above can still have a higher priority.
+// The largest priority. Close to the eye, priorities have no upper bound. They are
+// clamped, so that the page above can still have a higher priority.
 constexpr float kMostPriority = 1073741824.0f;
-// Slots whose pages one search selects for eviction.
+// Maximum number of slots that one search selects for eviction.
 constexpr size_t kMostLeaving = 4096;
-constexpr size_t kMostChosen = size_t(1) << 14;  // pages to read before the next choice
+constexpr size_t kMostChosen = size_t(1) << 14;  // number of pages to read before the
+                                                 // next choice
 constexpr int32_t kRootSlot = -2;
 constexpr int32_t kNoSlot = -1;
-constexpr size_t kAhead = 16;  // distance of prefetching, in needs
+constexpr size_t kAhead = 16;  // pages are prefetched this many needs ahead
 
-// A key is a priority of at least 1/2, rounded down to a sixteenth of a power of two:
-// the exponent of the float and the upper four of its 23 mantissa bits.
+// A key is a priority of at least 1/2, rounded down to a sixteenth of a power of two.
+// It consists of the exponent of the float and the upper four of its 23 mantissa bits.
 constexpr uint32_t kNumKeys = 1024;
 constexpr uint32_t kKeyShift = 19;
 constexpr uint32_t kFirstKey = 0x3f000000u >> kKeyShift;
-// The key of priority 1. The cut does not miss a page with a lower key: the page is
-// only requested ahead of use.
+// The key of priority 1. A page with a lower key is only requested ahead of use: the
+// cut does not miss it.
 constexpr uint32_t kKeyOfMissed = (0x3f800000u >> kKeyShift) - kFirstKey;
 
-// The approximate bytes of a stretch: adjacent pages that are read together, because
-// disks are faster with large requests. Pages that are adjacent in the file are close
-// in space and have equal levels, so their priorities are mostly similar. A stretch has
-// the key of its most urgent wanted page.
+// The approximate number of bytes in a stretch. A stretch consists of adjacent pages
+// that are read together, because disks are faster with large requests. Pages that are
+// adjacent in the file are close in space and usually have equal levels, so their
+// priorities are similar. The key of a stretch is the key of its most urgent wanted
+// page.
 constexpr size_t kStretchBytes = size_t(512) << 10;
 constexpr uint32_t kNoStretch = UINT32_MAX;
 
 uint32_t key_of(float priority) {
-    uint32_t bits;  // the bits of positive floats compare like the floats
+    uint32_t bits;  // bits of positive floats have the same order as the floats
     std::memcpy(&bits, &priority, sizeof bits);
     return std::clamp(bits >> kKeyShift, kFirstKey, kFirstKey + kNumKeys - 1) - kFirstKey;
 }
@@ -169,7 +171,8 @@ void PagePolicy::use(int32_t slot, bool is_needed) {
     }
 }
 
-// Returns the topmost page that failed, among this page and the pages above it, or -1.
+// Returns the topmost failed page among this page and the pages above it, or -1 if
+// there is none.
 int32_t PagePolicy::block_above(int32_t id) const {
     int32_t blocked = -1;
     for (; id >= 0; id = pages_[id].parent)
@@ -178,7 +181,7 @@ int32_t PagePolicy::block_above(int32_t id) const {
 }
 
 // Adds an absent page, and the absent pages above it, to the wanted pages. Returns how
-// many of these pages the cut misses, without pages that were counted before.
+// many of these pages the cut misses and have not been counted before.
 size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
     auto id = static_cast<int32_t>(id_of(request.bundle, request.page));
     const int32_t blocked = has_failures ? block_above(id) : -1;
@@ -226,7 +229,7 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
 }
 
 // Sorts the wanted pages in the order of the file, and replaces the key of each page by
-// the key of its stretch. A stretch never has both a page and a page below it. The
+// the key of its stretch. A stretch never contains both a page and a page below it. The
 // stretch of a page is more urgent than the stretches of the pages below it.
 void PagePolicy::find_stretches() {
     std::sort(wanted_.begin(), wanted_.end(), [](const Wanted& a, const Wanted& b) {
@@ -236,7 +239,7 @@ void PagePolicy::find_stretches() {
     uint32_t bundle = UINT32_MAX;
     size_t pages_of_stretch = 1;
     size_t number = 0;        // number of the stretch in its bundle
-    int32_t least_above = 0;  // first of the pages above the pages of the stretch
+    int32_t least_above = 0;  // smallest index of a page above the pages of the stretch
     for (const Wanted& w : wanted_) {
         const auto id = static_cast<int32_t>(id_of(w.bundle, w.page));
         if (w.bundle != bundle)
@@ -255,7 +258,7 @@ void PagePolicy::find_stretches() {
         key_of_stretch_.back() = std::max(key_of_stretch_.back(), w.key);
     }
     // In the file, a page follows the pages below it. So the key of a stretch is final
-    // when the loop reaches its first page.
+    // when the loop reaches the first page of the stretch.
     for (Wanted& w : wanted_) {
         const Page& page = pages_[id_of(w.bundle, w.page)];
         const Page& above = pages_[page.parent];
@@ -264,7 +267,8 @@ void PagePolicy::find_stretches() {
             uint32_t& key_above = key_of_stretch_[above.stretch];
             key_above = std::min(std::max(key_above, key + 1), kNumKeys - 1);
         }
-        // Pages that are requested ahead come after all pages that the cut misses.
+        // Pages that are requested ahead of use come after all pages that the cut
+        // misses.
         w.key = w.key < kKeyOfMissed ? std::min(key, kKeyOfMissed - 1) : key;
     }
 }
@@ -282,7 +286,7 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
     const size_t unneeded = num_old(needed_), unused = num_old(used_);
     const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
     const size_t most = std::min(room > under_way ? room - under_way : 0, kMostChosen);
-    // The list begins with the least urgent pages. Leave out the pages that have no
+    // The list begins with the least urgent pages. Drop those for which there is no
     // room.
     size_t num_left_out = wanted_.size() > most ? wanted_.size() - most : 0;
     todo.resize(wanted_.size() - num_left_out);
@@ -318,7 +322,7 @@ void PagePolicy::evict(uint32_t s, PagesComing& out) {
     free_slots_.push_back(s);
 }
 
-// Collects slots that may be evicted. Called when no slot is free.
+// Collects slots whose pages may be evicted. Called if no slot is free.
 void PagePolicy::find_leaving() {
     for (uint32_t s = 0; s < slots_.size(); ++s)
         if (may_go(s)) leaving_.push_back({uses_[s].last_used, s});
@@ -330,8 +334,8 @@ void PagePolicy::find_leaving() {
     has_none_leaving_ = leaving_.empty();
 }
 
-// Removes slots from the front of the heap if they have been used since they were
-// added. Returns whether a slot is left that may be evicted.
+// Removes slots from the front of the heap if they were used after they were added to
+// it. Returns whether a slot is left that may be evicted.
 bool PagePolicy::has_leaving() {
     while (!leaving_.empty()) {
         const Leaving& first = leaving_.front();
@@ -342,9 +346,9 @@ bool PagePolicy::has_leaving() {
     return false;
 }
 
-// Evicts a page unless a slot is free. Returns whether a slot is free then.
-// `is_missed`: the slot is for a page that the cut misses, not for a page that is
-// requested ahead.
+// Evicts a page if no slot is free. Returns whether a slot is free afterwards.
+// `is_missed` tells whether the slot is for a page that the cut misses, or for one that
+// is requested ahead of use.
 bool PagePolicy::make_room(bool is_missed, PagesComing& out) {
     if (!free_slots_.empty()) return true;
     if (!has_leaving() && !has_none_leaving_) find_leaving();
@@ -388,7 +392,7 @@ void PagePolicy::bring(std::vector<LoadedPage>& loaded, size_t most_bytes, Pages
     std::sort(loaded.begin(), loaded.end(), [](const LoadedPage& a, const LoadedPage& b) {
         if (a.priority != b.priority) return a.priority > b.priority;
         return a.bundle != b.bundle ? a.bundle < b.bundle
-                                    : a.page > b.page;  // pages above come first
+                                    : a.page > b.page;  // pages above others come first
     });
     left_.clear();
     for (const LoadedPage& next : loaded) {

@@ -1,14 +1,14 @@
 #pragma once
 
-// The decisions of a page pool: which pages are read, which become resident, which are
-// evicted, and in which order. The policy uses no threads and no files. One thread at a
-// time calls it, and tells it which pages were read.
+// The decisions of a page pool: which pages are read, become resident, or are evicted,
+// and in which order. The policy uses no threads and no files. Only one thread at a
+// time may call it. That thread reports to it which pages were read.
 //
 // The memory of a pool has rows of gaussians and entries of clusters. It begins with
-// the coarsest pages of all bundles, which are never evicted. Then follow slots of
-// equal size. Any other page fits into a slot. A page becomes resident only after the
-// page above it, and is evicted only when no page below it is resident. So with each
-// page, all pages above it are resident.
+// the coarsest pages of all bundles, which are never evicted. The rest is divided into
+// slots of equal size, each of which has room for any other page. A page becomes
+// resident only after the page above it, and is evicted only when no page below it is
+// resident. So with each resident page, all pages above it are resident.
 
 #include <atomic>
 #include <cstdint>
@@ -21,8 +21,8 @@
 
 namespace v3dg {
 
-// A bundle of which only some pages are resident. Only the constructor reads the table:
-// its groups and clusters.
+// A bundle of which only some pages are resident. Only the constructor of PagePolicy
+// reads the groups and clusters of its table.
 struct PagedBundle {
     ClusterTable table;
     std::shared_ptr<const PageSource> source;
@@ -33,7 +33,7 @@ struct PoolMemory {
     size_t num_bytes;
     size_t row_bytes;               // per gaussian
     size_t cluster_bytes;           // per cluster, in addition to its gaussians
-    size_t most_rows = UINT32_MAX;  // limit of the device's row indices
+    size_t most_rows = UINT32_MAX;  // maximum that the device's row indices allow
 
     size_t bytes_of(size_t num_rows, size_t num_clusters) const {
         return num_rows * row_bytes + num_clusters * cluster_bytes;
@@ -47,13 +47,13 @@ struct SlotPlan {
 
     size_t num_rows() const { return first_slot_row + num_slots * slot_rows; }
     size_t num_clusters() const { return first_slot_cluster + num_slots * slot_clusters; }
-    // Returns the number of cluster entries that belong to a page of `num_clusters`
-    // clusters at entry `cluster`. A page in a slot has all entries of the slot; a
-    // coarsest page has one entry per cluster.
+    // Returns the number of cluster entries that are reserved for a page of
+    // `num_clusters` clusters at entry `cluster`. For a page in a slot, these are all
+    // entries of the slot. A coarsest page has one entry per cluster.
     size_t num_clusters_at(size_t cluster, size_t num_clusters) const {
         return cluster < first_slot_cluster ? num_clusters : slot_clusters;
     }
-    // Returns the first row of each cluster entry if all slots are empty. The result is
+    // For empty slots, returns the first row of each cluster entry. The result is
     // ascending and has num_clusters() + 1 elements.
     std::vector<int64_t> empty_offsets() const;
 };
@@ -61,9 +61,9 @@ struct SlotPlan {
 // A page that becomes resident, or that is evicted.
 struct PageChange {
     uint32_t bundle, page;
-    int64_t row;                 // first row of the page; kAbsentPage if it is evicted
+    int64_t row;                 // first row of the page, or kAbsentPage if it is evicted
     size_t cluster;              // first cluster entry of the page
-    const unsigned char* bytes;  // content of the page; null if it is evicted
+    const unsigned char* bytes;  // content of the page, or null if it is evicted
 };
 
 enum class PageState : uint8_t { absent, loading, loaded, resident, failed };
@@ -72,22 +72,23 @@ enum class PageState : uint8_t { absent, loading, loaded, resident, failed };
 struct LoadedPage {
     uint32_t bundle, page;
     unsigned char* block;
-    float priority = 0;  // in the last view that requested the page
+    float priority = 0;  // priority in the last view that requested the page
 };
 
 // The result of PagePolicy::bring().
 struct PagesComing {
     std::vector<PageChange> changes;      // in the order in which they must be applied
-    std::vector<unsigned char*> dropped;  // blocks of pages that are no longer wanted
+    std::vector<unsigned char*> dropped;  // blocks of pages that are not wanted any
+                                          // more
     size_t bytes = 0;                     // total size of the pages that become resident
-    // Pages that wait only because of the limit on bytes per frame.
+    // Number of pages that wait only because of the limit on bytes per frame.
     size_t num_left = 0;
 
     void clear();
 };
 
-// Any thread may call the const functions except missing() and needed(). All other
-// functions belong to the deciding thread.
+// Any thread may call the const functions, except for missing() and needed(). Only the
+// deciding thread may call all others.
 class PagePolicy {
   public:
     // Throws std::invalid_argument if the memory has no room for the coarsest page and
@@ -96,7 +97,7 @@ class PagePolicy {
 
     size_t num_slots() const { return slots_.size(); }
     const SlotPlan& plan() const { return plan_; }
-    // Returns the coarsest page of a bundle, without its content.
+    // Returns the coarsest page of a bundle. Its content is not set.
     PageChange root(size_t bundle) const;
     size_t num_pages() const { return slot_of_page_.size; }
     size_t most_page_bytes() const { return most_page_bytes_; }
@@ -109,7 +110,7 @@ class PagePolicy {
     int32_t page_above(uint32_t id) const { return pages_[id].parent; }
 
     // Returns the state of a page, which any thread may read. Reading threads change it
-    // from absent to loading, and from loading to loaded or failed.
+    // from absent to loading, and then to loaded or failed.
     std::atomic<PageState>& state(size_t bundle, size_t page) const {
         return states_[id_of(bundle, page)];
     }
@@ -117,23 +118,23 @@ class PagePolicy {
     // Allocates memory for `num_loaded` pages, so that bring() need not allocate.
     void reserve(size_t num_loaded) { left_.reserve(num_loaded); }
 
-    // Notes the pages that the cut of a frame needs, absent or resident, in any order.
-    // `num_left_out` is the number of needs for which the list had no room.
+    // Records the pages that the cut of a frame needs, absent or resident, in any
+    // order. `num_left_out` is the number of needs that did not fit in the list.
     // `has_failures` tells whether some pages cannot be read.
     void note(Span<const PageRequest> needs, size_t num_left_out, bool has_failures);
-    // Sets `todo` to the absent pages of the noted view, in the order of reading:
-    // readers take pages from the end. The most urgent stretch comes last. Within a
-    // stretch, pages are in descending order, so that a page above is read before the
-    // pages below it. The list is limited to the free memory; `under_way` pages that
-    // are loading or loaded use some of it.
+    // Sets `todo` to the absent pages of the last view. Readers take pages from the end
+    // of the list, so the most urgent stretch is last. Within a stretch, pages are in
+    // descending order, so that a page above is read before the pages below it. The
+    // list is limited to the free memory, some of which is used by `under_way` pages
+    // that are loading or loaded.
     void choose(size_t under_way, std::vector<PageRequest>& todo);
-    // Return how many pages the noted view misses, and how many slots it would use.
+    // Return how many pages the last view misses, and how many slots it would use.
     size_t missing() const { return missing_; }
     size_t needed() const { return missing_ + num_needed_; }
 
-    // Assigns slots to loaded pages, the most urgent first. The total is about
-    // `most_bytes`, but at least one page. Pages that stay in `loaded` wait for a later
-    // frame, or for a page above them that is still being read.
+    // Assigns slots to loaded pages, most urgent first: about `most_bytes` in total,
+    // but at least one page. Pages that stay in `loaded` wait for a later frame, or for
+    // a page above them that is still being read.
     void bring(std::vector<LoadedPage>& loaded, size_t most_bytes, PagesComing& out);
 
   private:
@@ -141,32 +142,32 @@ class PagePolicy {
         std::shared_ptr<const PageSource> source;
         uint32_t first_page = 0;
         size_t root_row = 0, root_cluster = 0;
-        // Largest values over all pages except the coarsest.
+        // Maxima over all pages except the coarsest ones.
         size_t most_rows = 1, most_clusters = 1, most_bytes = 1;
     };
     struct Page {
-        // Index among the pages of all bundles; -1 for a coarsest page.
+        // Index among the pages of all bundles, or -1 for a coarsest page.
         int32_t parent = -1;
         uint32_t stamp = 0;  // last view that requested the page
         float priority = 0;  // priority in that view
-        // Stretch of the page in that view, if the page is wanted.
+        // Stretch of the page in that view, if the page was wanted.
         uint32_t stretch = 0;
     };
     struct Slot {
         int32_t bundle = -1;
         uint32_t page = 0;
     };
-    // The last use of the page in a slot.
+    // When the page in a slot was last used.
     struct Use {
         uint32_t last_needed = 0;  // last view that needed the page, plus 1
-        // Last view that needed, or nearly needed, the page, plus 1.
+        // Last view, plus 1, that needed the page or nearly needed it.
         uint32_t last_used = 0;
-        // Slot of the page above; negative if the page above is a coarsest page.
+        // Slot of the page above; negative if that page is a coarsest page.
         int32_t above = 0;
         uint32_t num_children = 0;  // number of resident pages directly below
     };
-    // The number of slots whose page was last needed (or used) in this view, and in the
-    // view before.
+    // How many slots have a page that was last needed (or used) in this view, and in
+    // the view before.
     struct Counts {
         size_t now = 0;
         size_t before = 0;
@@ -176,8 +177,8 @@ class PagePolicy {
         uint32_t page;
         uint32_t key;  // urgency; see kNumKeys
     };
-    // The range of `todo` for pages of one key: the number of unused positions, and the
-    // end.
+    // For pages of one key, their range in `todo`: the number of unused positions, and
+    // the end.
     struct Places {
         uint32_t count = 0;
         uint32_t end = 0;
@@ -219,8 +220,8 @@ class PagePolicy {
     SlotPlan plan_;
     size_t most_page_bytes_ = 1;
 
-    // The slot of each page. Pages that are absent, that are being loaded, or that are
-    // the coarsest of their bundle have no slot.
+    // The slot of each page. A page has none if it is absent or loading, or if it is
+    // the coarsest page of its bundle.
     Buffer<int32_t> slot_storage_;
     Buffer<Page> page_storage_;
     Span<int32_t> slot_of_page_;
@@ -231,17 +232,17 @@ class PagePolicy {
     std::vector<Use> uses_;
     std::vector<uint32_t> free_slots_;
 
-    uint32_t noted_ = 1;  // number of noted views, plus 1
+    uint32_t noted_ = 1;  // number of recorded views, plus 1
     Counts needed_, used_;
     size_t missing_ = 0, num_needed_ = 0;
     std::vector<Wanted> wanted_;
     std::vector<uint32_t> key_of_stretch_;
     std::vector<Places> places_of_key_;
-    // A heap of slots that may be evicted. The slot that was unused for longest is in
-    // front. The heap is kept from frame to frame, because slots that become old later
-    // were also used later.
+    // A heap of slots that may be evicted, with the least recently used slot in front.
+    // It is kept from frame to frame: slots that become old later were also used later,
+    // so the heap stays valid.
     std::vector<Leaving> leaving_;
-    // True if no slot can be evicted before the next view is noted.
+    // True if no slot can be evicted before the next view is recorded.
     bool has_none_leaving_ = false;
     std::vector<LoadedPage> left_;
 };

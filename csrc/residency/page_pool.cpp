@@ -1,4 +1,4 @@
-// Implements page_pool.h: creates the parts of a pool (pool_shared.h lists them),
+// Implements page_pool.h. It creates the parts of a pool, which pool_shared.h lists,
 // starts and ends its threads, and has the functions that belong to no single part.
 
 #include "residency/page_pool.h"
@@ -21,10 +21,10 @@ constexpr float kToleranceLeap = 1.189207f;
 constexpr float kLeastToleranceRaised = 1e-6f;
 // Approximate number of pages whose sizes are sampled.
 constexpr size_t kSamples = 1 << 14;
-// The time that the destructor of a pool waits for the pool's threads.
+// The longest time for which the destructor of a pool waits for its threads.
 constexpr std::chrono::seconds kMostWaitForEnd{2};
 
-// Returns the sizes of about kSamples pages, without the coarsest ones.
+// Returns the sizes of about kSamples pages, without coarsest pages.
 std::vector<size_t> sampled_sizes(const PagePolicy& policy, size_t num_bundles) {
     std::vector<size_t> samples;
     const size_t step = policy.num_pages() / kSamples + 1;
@@ -45,12 +45,12 @@ struct PagePool::State {
     static void start_threads(const std::shared_ptr<State>& state);
     void stop_threads();
 
-    // After construction, only the decider uses the parts of the policy that change.
+    // After construction, only the decider uses those parts of the policy that change.
     PagePolicy policy;
     std::shared_ptr<BlockMemory> memory;
     int max_sh_degree = 0;
     size_t most_needs = 0;
-    size_t most_bytes = 0;    // total of all blocks and of the coarsest pages
+    size_t most_bytes = 0;    // total size of all blocks and coarsest pages
     size_t most_changes = 0;  // largest number of page changes in a frame
 
     PoolShared shared;
@@ -59,7 +59,8 @@ struct PagePool::State {
     PoolFrames frames;
 };
 
-// Allocates all memory that the threads write to, so that no thread runs out of memory.
+// Allocates all memory that the threads write to, so that no thread can run out of
+// memory.
 PagePool::State::State(const std::vector<PagedBundle>& bundles, const PoolLimits& limits,
                        std::shared_ptr<BlockMemory> block_memory)
     : policy(bundles, limits.memory),
@@ -78,9 +79,9 @@ PagePool::State::State(const std::vector<PagedBundle>& bundles, const PoolLimits
     const size_t num_blocks = shared.blocks.num_blocks();
     most_bytes = root_bytes + shared.blocks.num_bytes();
     most_changes = 2 * num_blocks + bundles.size();
-    // Further requests of a frame are left out. A page usually has two clusters, each
-    // of which may request another page. So eight requests per slot leave room for
-    // larger groups.
+    // Requests beyond this number are dropped. A page usually has two clusters, each of
+    // which may request another page; eight requests per slot leave room for larger
+    // groups.
     most_needs = std::min(policy.num_pages(), 8 * policy.num_slots() + 1024);
     decider.reserve(num_blocks, most_changes);
     shared.read.reserve(num_blocks);
@@ -125,9 +126,9 @@ PagePool::PagePool(const std::vector<PagedBundle>& bundles, const PoolLimits& li
     State::start_threads(state_);
 }
 
-// The state outlives the pool in two cases. A thread that waits for a disk for ever
-// keeps the state that it writes to. In a child of fork(), the mutex in the state must
-// not be destroyed.
+// The state may outlive the pool in two cases. A thread that waits for a disk forever
+// writes to its state later. In a child of fork(), the mutex in the state must not be
+// destroyed.
 PagePool::~PagePool() {
     if (process_id() != state_->shared.process)
         static_cast<void>(new std::shared_ptr<State>(state_));

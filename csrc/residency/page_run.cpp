@@ -1,6 +1,6 @@
-// Reads, verifies and decodes adjacent pages of a file; encodes, hashes and writes
-// them. A thread works on several pages at once, because they are hashed in parallel
-// lanes.
+// Reads, verifies and decodes adjacent pages of a file; or encodes, hashes and writes
+// them. A thread processes several pages at once, because they are hashed in parallel
+// SIMD lanes.
 
 #include "residency/page_run.h"
 
@@ -16,7 +16,8 @@
 
 namespace v3dg {
 
-// The number of pages that a thread reads at once: as many as are hashed in parallel.
+// Number of pages that a thread reads at once, which equals the number of pages that
+// are hashed in parallel.
 constexpr size_t kFew = 8;
 
 static std::string name_of(const PageRun& run, size_t page) {
@@ -44,7 +45,7 @@ static void read_few(const File& file, const PageRun& run, size_t first, size_t 
     }
 }
 
-// Calls read(first page, number of pages) for parts of the run, on all threads.
+// Calls read(first page, number of pages) for parts of the run, using all threads.
 template <class Read>
 static void for_few_pages(const PageRun& run, const Read& read) {
     const size_t share = run.size() / static_cast<size_t>(most_threads());
@@ -90,7 +91,7 @@ void read_pages(const File& file, const PageRun& run, PageCodec codec,
     });
 }
 
-// Encodes one page. `clusters` has the first row of each of its clusters, and the end.
+// Encodes one page. `clusters` has the first row of each of its clusters, then the end.
 static void encode(Span<const int64_t> clusters, PageCodec codec,
                    const GaussianRows<const float>& rows, unsigned char* bytes) {
     if (codec == PageCodec::quantized) {

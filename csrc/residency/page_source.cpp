@@ -1,5 +1,6 @@
-// Reads pages in three steps: adjacent pages in one system call; single pages if that
-// fails, so that the error names the page; then all hashes together.
+// Reads pages in three steps. First, adjacent pages are read in one system call. If
+// that fails, single pages are read, so that the error names the right page. Finally,
+// all hashes are verified together.
 
 #include "residency/page_source.h"
 
@@ -69,11 +70,11 @@ static void read_one(const File& file, Span<const int64_t> places, PageReading& 
     }
 }
 
-// A gap of at most this many bytes between two pages is read and discarded, which is
-// faster than a second system call. It is the size of one or two pages.
+// A gap between two pages of at most this size is read and discarded, which is faster
+// than a second system call. It is the size of one or two pages.
 constexpr size_t kMostSkippedBytes = size_t(32) << 10;
 
-// Returns the end of the pages that are read in one system call with page `first`.
+// Returns the end of the pages that are read in the same system call as page `first`.
 static size_t end_of_run(Span<const int64_t> places, Span<const PageReading> pages, size_t first) {
     size_t end = first + 1;
     while (end < pages.size &&
@@ -101,7 +102,7 @@ static void read_run(const File& file, Span<const int64_t> places, Span<PageRead
     try {
         if (file.read_at(first, {pieces, count}) == static_cast<size_t>(place - first)) return;
     } catch (const std::system_error&) {
-        // Read page by page, to find the page that fails, and whether it fails again.
+        // Read page by page, to find out which page fails, and whether it fails again.
     }
     for (PageReading& reading : run) read_one(file, places, reading, name_of);
 }
@@ -148,7 +149,7 @@ void FilePages::expect(Span<const PageReading> pages) const {
     }
 }
 
-// Fetches the pages. Returns whether they can be read now; if not, sets their errors.
+// Fetches the pages. Returns whether they can be read now. If not, sets their errors.
 bool FilePages::fetch(Span<PageReading> pages) const {
     int64_t places[2 * kMostPagesTogether];
     size_t count = 0;

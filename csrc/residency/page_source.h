@@ -1,8 +1,8 @@
 #pragma once
 
 // The sources of a bundle's pages: a file, which may have to be fetched first, or
-// memory. Also the codecs of pages (PageCodec). Any thread may read from a source.
-// docs/extending.md describes how to add a codec.
+// memory. Also the codecs of pages (PageCodec); docs/extending.md describes how to add
+// one. Any thread may read from a source.
 
 #include <cstdint>
 #include <functional>
@@ -30,20 +30,20 @@ class PageError : public std::runtime_error {
 
 constexpr const char* kDamaged = "the file is damaged, copy or build it again";
 
-// A page to read, where to read it to, and the error if reading fails.
+// A page to read, the memory to read it into, and the error if reading fails.
 struct PageReading {
     size_t page;
     unsigned char* bytes;  // must have room for the whole page
     std::optional<PageError> error;
 };
-// The largest number of pages that are read together. It is a constant, so that reading
-// need not allocate.
+// Maximum number of pages that are read together. It is a constant, so that reading
+// need not allocate memory.
 constexpr size_t kMostPagesTogether = 64;
 
-// Reads at most kMostPagesTogether pages of a file, in ascending order, and verifies
-// their hashes, several at once. Adjacent pages are read in one system call, with small
-// gaps between them. `places` is [P + 1], the offset of each page and the end; `hashes`
-// is [P][16]. Errors begin with name_of(page).
+// Reads at most kMostPagesTogether pages of a file, in ascending order. Adjacent pages,
+// and pages with small gaps between them, are read in one system call. The hashes of
+// several pages are verified at once. `places` is [P + 1], the offset of each page and
+// the end; `hashes` is [P][16]. Error texts begin with name_of(page).
 void read_verified(const File& file, Span<const int64_t> places, const uint8_t* hashes,
                    Span<PageReading> pages, const std::function<std::string(size_t)>& name_of);
 
@@ -62,7 +62,7 @@ class PageSource {
         return first_cluster_[page + 1] - first_cluster_[page];
     }
     size_t first_cluster(size_t page) const { return first_cluster_[page]; }
-    // Returns the first row of each cluster of a page, and the end: [K + 1], indices in
+    // Returns the first row of each cluster of a page, then the end: [K + 1] indices in
     // the bundle.
     Span<const int64_t> clusters(size_t page) const;
     int64_t first_row(size_t page) const { return offset_[first_cluster_[page]]; }
@@ -72,18 +72,17 @@ class PageSource {
 
     // Returns the bytes of a page, including padding.
     virtual size_t num_bytes(size_t page) const = 0;
-    // Reads at most kMostPagesTogether pages, in ascending order, and verifies them.
-    // Adjacent pages are fastest.
+    // Reads and verifies at most kMostPagesTogether pages, in ascending order. Adjacent
+    // pages are read fastest.
     virtual void read_pages(Span<PageReading> pages) const = 0;
     // Reads and verifies one page. Throws PageError.
     void read(size_t page, unsigned char* bytes) const;
-    // Returns whether the source is so slow that pages are not read ahead of use.
+    // Returns whether the source is so slow that pages should not be read ahead of use.
     virtual bool is_far() const { return false; }
     // Announces that these pages will be read soon.
     virtual void expect(Span<const PageReading> pages) const { static_cast<void>(pages); }
 
-    // Converts the bytes of a page to rows. The rows borrow from `bytes` or from
-    // `decoded`.
+    // Converts the bytes of a page to rows. The rows point into `bytes` or `decoded`.
     GaussianRows<const float> rows(size_t page, const unsigned char* bytes,
                                    std::vector<float>& decoded) const;
 
@@ -94,13 +93,13 @@ class PageSource {
     std::vector<int64_t> offset_;        // [C + 1]
 };
 
-// A function that fetches parts of a file before they are read. The argument has two
-// numbers per part: its first byte and its end. Returns an error text, or an empty
-// string. Any thread may call it.
+// A function that fetches parts of a file before they are read. Its argument has two
+// numbers per part, the first byte and the end. It returns an error text, or an empty
+// string on success. Any thread may call it.
 using Fetch = std::function<std::string(Span<const int64_t>)>;
 
-// The pages of a file, which stays open as long as this object. The file may be renamed
-// or removed meanwhile. If it is truncated or overwritten, the hashes detect that.
+// The pages of a file, which stays open while this object exists. Meanwhile, the file
+// may be renamed or removed. If it is truncated or overwritten, the hashes detect this.
 class FilePages : public PageSource {
   public:
     // `place` is [P + 1] and `hash` is [P][16] (docs/format.md). `fetch` is empty if
@@ -137,7 +136,7 @@ class MemoryPages : public PageSource {
     const GaussianRows<const float> rows_;
 };
 
-// Returns the rows of a page of float32 gaussians. They borrow from `bytes`.
+// Returns the rows of a page of float32 gaussians. They point into `bytes`.
 GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians,
                                        int sh_degree);
 

@@ -1,5 +1,6 @@
-// The rounds of the decider. A round takes page requests and loaded pages with the
-// mutex held, decides without the mutex, and publishes the results with the mutex held.
+// The rounds of the decider. A round first takes page requests and loaded pages, with
+// the mutex locked. It then decides without the mutex. Finally, it locks the mutex
+// again and publishes the results.
 
 #include "residency/pool_decider.h"
 
@@ -9,8 +10,8 @@
 
 namespace v3dg {
 
-// kToleranceStep: the factor of the tolerance per frame. kRoomyShare: the share of the
-// slots below which the tolerance may fall.
+// In each frame, the tolerance changes by at most the factor kToleranceStep. It may
+// fall while less than the fraction kRoomyShare of the slots is needed.
 constexpr float kToleranceStep = 1.02f;
 constexpr double kRoomyShare = 0.7;
 
@@ -21,8 +22,8 @@ void PoolDecider::reserve(size_t num_blocks, size_t num_changes) {
     coming_.changes.reserve(num_changes);
 }
 
-// Decides about the state at the beginning of the round, without the mutex. Changes
-// that other threads make meanwhile belong to the next round.
+// Decides about the state at the beginning of the round, without locking the mutex.
+// Changes that other threads make meanwhile belong to the next round.
 void PoolDecider::decide(PoolShared& shared) {
     ++shared.rounds_begun;
     shared.wants_round = false;
@@ -68,8 +69,8 @@ void PoolDecider::decide(PoolShared& shared) {
     shared.has_changed.notify_all();
 }
 
-// Starts from the tolerance of the frame that reported its needs. So several frames in
-// flight cause only one step.
+// Starts from the tolerance of the frame that reported its needs. Therefore several
+// frames in flight cause only one step.
 void PoolDecider::adapt_tolerance(PoolShared& shared, const FrameNeeds& needs) {
     const size_t slots = policy_.num_slots();
     const size_t needed = shared.needed;

@@ -1,10 +1,10 @@
 #pragma once
 
-// The decider of a page pool: it decides which pages are read, become resident, or are
+// The decider of a page pool. It decides which pages are read, become resident, or are
 // evicted.
 //
-// One thread at a time uses its fields: the deciding thread or, in a pool without
-// threads, the drawing thread. The drawing thread calls decide_next_round() and
+// Only one thread at a time uses its fields: the deciding thread or, in a pool without
+// threads, the drawing thread. The drawing thread may also call decide_next_round() and
 // forget_failures(). No function waits for a file, and only decide_next_round() waits
 // for another thread.
 
@@ -20,16 +20,17 @@ class PoolDecider {
   public:
     explicit PoolDecider(PagePolicy& policy) : policy_(policy) {}
 
-    // Allocates the memory for decide(), so that decide() never runs out of memory.
+    // Allocates all memory for decide(), so that decide() cannot run out of memory.
     void reserve(size_t num_blocks, size_t num_changes);
 
     // The main function of the deciding thread. Returns when the pool ends.
     void decide_always(PoolShared& shared) V3DG_EXCLUDES(shared.busy);
-    // Returns when the pool has decided about everything known at the time of the call.
-    // Waits for the deciding thread; without one, the calling thread decides.
+    // Returns after the pool has decided about everything that is known at the time of
+    // the call. Waits for the deciding thread; if there is none, the calling thread
+    // decides.
     void decide_next_round(PoolShared& shared) V3DG_REQUIRES(shared.busy);
-    // Forgets which pages could not be read, so that they are tried again. Must not be
-    // called during a round.
+    // Clears the record of pages that could not be read, so that they are tried again.
+    // Must not be called during a round.
     void forget_failures(PoolShared& shared) V3DG_REQUIRES(shared.busy);
 
   private:

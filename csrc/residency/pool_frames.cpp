@@ -1,4 +1,4 @@
-// The exchange between frames and the other threads of a pool, and the tables of
+// The exchange between frames and the other threads of a pool. Also the tables of
 // resident pages.
 
 #include "residency/pool_frames.h"
@@ -45,7 +45,7 @@ void PoolFrames::reserve(size_t num_blocks, size_t num_changes, size_t num_frame
     taken_.reserve(num_blocks);
     returned_.reserve(num_blocks);
     // There are two more buffers than frames in flight: one waits for the decider, and
-    // the decider is using one.
+    // another is used by the decider.
     all_needs_.resize(num_frames + 2);
     for (FrameNeeds& needs : all_needs_) {
         needs.list =
@@ -89,13 +89,14 @@ void PoolFrames::swap_changes(PoolShared& shared, bool is_bounded) {
     shared.ready_bytes = 0;
     shared.has_noted = false;
     // A frame that is not bounded waits for the decision about its own view. If the
-    // pool decided about an earlier view first, `ready` would be filled, and no other
-    // view could be noted before the next frame.
+    // pool decided about an earlier view first, it would fill `ready`, and no other
+    // view could be recorded before the next frame.
     if (!is_bounded) forget_noted(shared);
     if (shared.has_to_decide()) shared.to_decide.notify_one();
 }
 
-// Updates the tables for the changes of the frame, and remembers their blocks.
+// Updates the tables for the changes of the frame, and keeps the blocks of these
+// changes.
 void PoolFrames::apply_changes(PoolShared& shared) {
     for (const PageChange& change : changes_) {
         const PageSource& source = policy_.source(change.bundle);
@@ -112,8 +113,8 @@ void PoolFrames::apply_changes(PoolShared& shared) {
     }
 }
 
-// Passes page requests and free blocks to the other threads, and takes back the memory
-// of page requests that were decided about.
+// Passes page requests and free blocks to the other threads. Takes back the memory of
+// page requests that the pool has decided about.
 void PoolFrames::exchange(PoolShared& shared) {
     if (to_note_ != nullptr) {
         if (shared.noted != nullptr) idle_needs_.push_back(shared.noted);
@@ -130,7 +131,7 @@ void PoolFrames::exchange(PoolShared& shared) {
     if (shared.has_to_decide()) shared.to_decide.notify_one();
 }
 
-// Withdraws the noted view if no round has started with it.
+// Withdraws the recorded view, unless a round has already started with it.
 void PoolFrames::forget_noted(PoolShared& shared) {
     if (shared.noted != nullptr) idle_needs_.push_back(std::exchange(shared.noted, nullptr));
 }
@@ -184,7 +185,7 @@ void PoolFrames::begin_settling(PoolShared& shared) {
     const PoolLock lock(shared);
     exchange(shared);
     forget_noted(shared);
-    // Wait, because a round in progress may change the tolerance at its end.
+    // Wait, because a round in progress may change the tolerance when it ends.
     while (shared.is_deciding()) shared.has_changed.wait(shared.busy);
     decider_.forget_failures(shared);
     shared.least_tolerance = 0;

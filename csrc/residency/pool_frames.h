@@ -5,8 +5,8 @@
 //
 // The callers of PagePool ensure that only one thread at a time, the drawing thread,
 // uses this class. So its fields need no mutex. Functions with `waits`, and frames that
-// are not bounded, wait for the mutex and for the next round of the decider. No other
-// function waits.
+// are not bounded, wait for the mutex and for the next round of the decider. Other
+// functions never wait.
 
 #include <cstddef>
 #include <cstdint>
@@ -24,10 +24,10 @@ class PoolFrames {
     PoolFrames(const PagePolicy& policy, PoolDecider& decider, size_t num_bundles);
 
     // Reads the coarsest pages, which arrive in the first frame. Returns their total
-    // bytes, including padding. Throws PageError.
+    // size in bytes, including padding. Throws PageError.
     size_t read_roots(BlockMemory& memory);
     // Allocates memory for the changes and the blocks of a frame, and for the page
-    // requests of several frames. Exchanges then need not allocate.
+    // requests of several frames, so that exchanges need not allocate.
     void reserve(size_t num_blocks, size_t num_changes, size_t num_frames, size_t most_needs,
                  BlockMemory& memory);
 

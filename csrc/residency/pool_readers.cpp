@@ -1,5 +1,5 @@
-// Reads batches of the most urgent pages. A reader takes a batch with the mutex held,
-// reads it without the mutex, and reports it with the mutex held.
+// Reads batches of the most urgent pages. A reader takes a batch with the mutex locked,
+// reads it without the mutex, and locks the mutex again to report the result.
 
 #include "residency/pool_readers.h"
 
@@ -12,9 +12,9 @@ namespace v3dg {
 namespace {
 
 constexpr int kTries = 3;
-// Pages that a thread announces to the disk together.
+// Number of pages that a thread announces to the disk together.
 constexpr size_t kMostAtOnce = 64;
-// The bytes of pages that a thread reads and hashes together.
+// Number of bytes of the pages that a thread reads and hashes together.
 constexpr size_t kMostBytesTogether = size_t(512) << 10;
 
 }  // namespace
@@ -44,8 +44,8 @@ bool PoolReaders::read_some(PoolShared& shared, size_t most) const {
     return true;
 }
 
-// Reads the pages in the order of the file: announces all of them to the disk, then
-// reads a few at a time.
+// Reads the pages in the order of the file. First announces all of them to the disk,
+// then reads a few at a time.
 void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
     std::sort(batch.begin(), batch.end(), [](const Reading& a, const Reading& b) {
         return a.page.bundle != b.page.bundle ? a.page.bundle < b.page.bundle
@@ -56,8 +56,8 @@ void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
         pages[k].page = batch[k].page.page;
         pages[k].bytes = batch[k].block;
     }
-    // Calls visit(bundle, pages) for runs of pages of one bundle, with at most
-    // `most_bytes` bytes per run, or one page.
+    // Calls visit(bundle, pages) for runs of pages of one bundle. A run has one page,
+    // or several with at most `most_bytes` bytes.
     const auto for_each_run = [&](size_t most_bytes, const auto& visit) {
         for (size_t first = 0, end = 0; first < batch.size; first = end) {
             const uint32_t bundle = batch[first].page.bundle;
@@ -77,8 +77,8 @@ void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
     });
 }
 
-// Reads pages of one bundle. Reports the pages that were read, and retries the pages
-// that failed.
+// Reads pages of one bundle. Reports the pages that were read, and tries the failed
+// ones again.
 void PoolReaders::read_together(PoolShared& shared, uint32_t bundle,
                                 Span<PageReading> pages) const {
     policy_.source(bundle).read_pages(pages);
@@ -120,7 +120,7 @@ void PoolReaders::finish(PoolShared& shared, uint32_t bundle, const PageReading&
 void PoolReaders::read_always(PoolShared& shared) const {
     const MutexLock lock(shared.busy);
     while (!shared.is_over) {
-        // Take only a part of the list, so that all threads have work.
+        // Take only a part of the list, so that all threads have something to read.
         const size_t share = shared.todo.size() / (2 * size_t(shared.limits.num_threads));
         if (read_some(shared, std::clamp<size_t>(share, 1, kMostAtOnce))) continue;
         shared.has_changed.notify_all();

@@ -1,11 +1,11 @@
 #pragma once
 
-// The readers of a page pool: they read the most urgent pages into blocks.
+// The readers of a page pool, which read the most urgent pages into blocks.
 //
 // Several threads read concurrently: the reading threads of the pool, and callers of
-// read_some(). They wait for files, but never with the mutex held. Their shared state
-// is in PoolShared. Of the policy they use only the sources, which are immutable, and
-// the states of pages, which are atomic.
+// read_some(). They wait for files, but never with the mutex locked. Their shared state
+// is in PoolShared. From the policy, they only use the sources, which are immutable,
+// and the states of pages, which are atomic.
 
 #include <cstddef>
 
@@ -22,12 +22,12 @@ class PoolReaders {
 
     // The main function of a reading thread. Returns when the pool ends.
     void read_always(PoolShared& shared) const V3DG_EXCLUDES(shared.busy);
-    // Reads at most `most` of the most urgent pages, and releases the mutex meanwhile.
-    // Returns whether there was a page to read and a block for it.
+    // Reads at most `most` of the most urgent pages. The mutex is unlocked while it
+    // reads. Returns whether there was a page to read and a free block for it.
     bool read_some(PoolShared& shared, size_t most) const V3DG_REQUIRES(shared.busy);
 
   private:
-    // A page to read, and where to read it to.
+    // A page to read, and the block to read it into.
     struct Reading {
         PageRequest page;
         unsigned char* block;

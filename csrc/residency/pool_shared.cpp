@@ -4,15 +4,15 @@
 
 namespace v3dg {
 
-// Attempts to lock before a frame continues without the mutex.
+// A frame tries this often to lock the mutex before it continues without it.
 constexpr int kSpins = 64;
 
 PoolShared::PoolShared(const PoolLimits& pool_limits, size_t num_slots)
     : limits(pool_limits),
       has_threads(pool_limits.num_threads > 0 && num_slots > 0),
       most_bytes_a_frame(pool_limits.most_bytes_a_frame),
-      // The number is not 0, so that pages count as missing until the pool has decided
-      // about the first view.
+      // A number above 0 makes pages count as missing until the pool has decided about
+      // the first view.
       missing(num_slots == 0 ? 0 : 1) {}
 
 void PoolShared::check_process() const {

@@ -1,5 +1,5 @@
-// Implements scene_tables.h: uploads instances and poses, and finds bounds on what one
-// camera sees.
+// Implements scene_tables.h. It uploads instances and poses, and computes bounds on
+// what one camera sees.
 
 #include "residency/scene_tables.h"
 

@@ -30,8 +30,8 @@ struct SceneOnDevice {
 // The number of clusters that a warp tests together.
 constexpr size_t kClustersOfPart = 32 * kClustersOfBounds;
 
-// Bounds on what one camera sees of a scene: its instances, and the parts of
-// kClustersOfPart clusters of the instances' tables.
+// Bounds on what one camera sees of a scene: the number of its instances, and the
+// number of parts of kClustersOfPart clusters in their tables.
 struct SeenBounds {
     size_t instances, parts;
 };
@@ -39,33 +39,33 @@ struct SeenBounds {
 // The bundles and instances of a scene, on the device that is current at construction.
 //
 // Work is enqueued on the stream that is passed, which must belong to the device. A
-// thread that enqueues work which reads the scene must hold lock(stream) meanwhile. The
-// lock orders the work of several threads and streams.
+// thread that enqueues work which reads the scene must hold lock(stream) while it does
+// so. The lock orders the work of different threads and streams.
 class SceneTables {
   public:
     SceneTables() = default;
 
     // Sets the bundles. An instance refers to a bundle by its index in the list. Only
     // pointers to the tables are copied to the device. Existing instances keep their
-    // indices: to add bundles, pass a longer list that begins with the current one.
+    // indices, so pass a longer list that begins with the current one to add bundles.
     // Throws std::invalid_argument if tables are on another device.
     void set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles, cudaStream_t stream);
-    // Replaces all instances. The caller must then call set_poses(), and may reuse host
-    // memory on return. `factors` is empty if all are 1.
+    // Replaces all instances. The caller must then call set_poses(). Host memory is
+    // copied before the function returns. `factors` is empty if all factors are 1.
     void set_instances(Span<const int32_t> bundle, Span<const float> importance,
                        Span<const InstanceFactors> factors, const EnvironmentTable& environments,
                        cudaStream_t stream);
-    // Sets the poses of all instances. A component is in host memory, which the caller
-    // may reuse on return, or in device memory, which must not change.
+    // Sets the poses of all instances. A component in host memory is copied before the
+    // function returns. A component in device memory must not be changed afterwards.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                    cudaStream_t stream);
-    // Sets the label of each instance; empty if no instance has one. The caller may
-    // reuse host memory on return.
+    // Sets the label of each instance. `label` is empty if no instance has one, and is
+    // copied before the function returns.
     void set_labels(Span<const int32_t> label, cudaStream_t stream);
 
     int device() const { return device_; }
-    // Returns the device memory in bytes, without the tables of bundles, which other
-    // scenes may share.
+    // Returns the device memory in bytes. It does not include the tables of bundles,
+    // which other scenes may share.
     size_t bytes() const;
     size_t num_bundles() const { return bundles_.size(); }
     size_t num_instances() const { return num_instances_; }
@@ -77,7 +77,7 @@ class SceneTables {
     const SeenBounds& seen_in_environment() const { return seen_in_environment_; }
 
     SceneOnDevice on_device() const;
-    // Locks the scene for enqueuing work on a stream.
+    // Locks the scene while the caller enqueues work on a stream.
     StreamLock lock(cudaStream_t stream) const { return StreamLock(busy_, stream); }
 
   private:

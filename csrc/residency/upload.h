@@ -14,7 +14,7 @@ namespace cuda {
 // Copies host arrays to one allocation on the device.
 class Upload {
   public:
-    // Adds an array. finish() makes `span` refer to the copy on the device.
+    // Adds an array. finish() will set `span` to the copy on the device.
     template <class T>
     void add(Span<const T>& span) {
         const size_t first = (num_bytes_ + kAlignment - 1) / kAlignment * kAlignment;
@@ -41,8 +41,7 @@ class Upload {
         add(table.pages.shift);
         add(table.pages.begins);
     }
-    // Allocates device memory and copies the arrays. Returns when they are on the
-    // device. The caller may then reuse host memory.
+    // Allocates device memory, and copies the arrays to it before it returns.
     void finish(DeviceBuffer<unsigned char>& storage, cudaStream_t stream) {
         storage.reserve(num_bytes_, stream);
         for (const auto& move : moves_) move(storage.data(), stream);

@@ -1,7 +1,7 @@
 #pragma once
 
 // Bounds on runs of adjacent clusters. If a bound shows that no cluster of a run is
-// drawn, the clusters are not tested one by one. A bound never changes a decision,
+// drawn, its clusters are not tested one by one. A bound never changes a decision,
 // because its margin exceeds the rounding errors of the bound and of the metric.
 
 #include <cmath>
@@ -42,13 +42,13 @@ V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const Instance
            (1.0f + kBoundMargin) * rule.tolerance_px2;
 }
 
-// The tolerances for which a bound must hold: only the tolerance of the rule, or this
-// tolerance and all larger tolerances.
+// The tolerances for which a bound must hold: only the tolerance of the rule, or also
+// all larger ones.
 enum class Tolerances { this_one, from_this_on };
 
 // Returns false only if none of the clusters is drawn at these tolerances. The bounds
-// do not consider which pages are resident. A group without a resident page always
-// fits, so owns_are_refined() is used only if all pages are resident.
+// ignore which pages are resident. A group whose page is absent counts as fitting, so
+// owns_are_refined() may only be used if all pages are resident.
 V3DG_HD inline bool may_draw(const ClusterTable& table, const ClusterBounds& bounds,
                              const InstanceView& view, const SelectRule& rule,
                              Tolerances tolerances) {
@@ -62,23 +62,23 @@ struct ClusterRange {
     uint32_t first, end;
 };
 
-// Bounds on the solid angle of a ball, if its radius is at most half its distance. Let
-// x2 be the square of radius / distance. The solid angle is between pi x2 and kMostOfPi
-// x2 steradians.
+// Upper bound on the solid angle of a ball whose radius is at most half its distance.
+// If x2 is the square of radius / distance, the solid angle is between pi x2 and
+// kMostOfPi x2 steradians.
 constexpr float kMostOfPi = 1.08f;
-// Limits of the test of whole runs. Outside of the limits, float32 may lose digits, or
+// Limits for testing whole runs. Outside these limits, float32 may lose digits, or
 // squares may overflow.
 constexpr float kLeastRunTolerance = 1e-20f, kLeastRunX2 = 1e-30f, kMostRunDistance = 1e18f;
 
-// Returns the clusters that must be tested one by one: a contiguous range of whole
-// runs. No cluster outside of the range is drawn at these tolerances.
+// Returns the clusters that must be tested one by one, a contiguous range of whole
+// runs. No cluster outside the range is drawn at these tolerances.
 V3DG_HD inline ClusterRange clusters_to_ask(const ClusterTable& table, const ClusterRuns& runs,
                                             const InstanceView& view, const SelectRule& rule,
                                             Tolerances tolerances) {
     const float distance = sqrtf(distance2_to(runs.groups, view));
     const float nearest = distance - runs.groups.radius, farthest = distance + runs.groups.radius;
     const float x2 =
-        // (radius / distance)² of a ball whose footprint is the tolerance
+        // (radius / distance)² of a ball whose footprint equals the tolerance
         rule.tolerance_px2 / (float(kPi) * view.px2_per_steradian);
     uint32_t first = 0, last = runs.count;
     if (rule.footprint == Footprint::solid_angle && nearest >= runs.least_distance &&

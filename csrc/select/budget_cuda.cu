@@ -1,10 +1,11 @@
-// Chooses the tolerance that meets a budget. change_kernel counts by how many gaussians
-// the cuts of consecutive bins differ (budget_math.h). choose_kernel then finds the
-// smallest tolerance from which on no cut exceeds the budget.
+// Chooses the tolerance that meets a budget. change_kernel computes, for each bin, the
+// difference in gaussians to the cut of the bin before (budget_math.h). choose_kernel
+// then finds the smallest tolerance from which on no cut exceeds the budget.
 //
-// The two kernels run in two rounds. The first round considers only tolerances above
-// half of the last choice, and thus skips the tables of distant instances. The second
-// round considers all tolerances, and runs only if a smaller one may be the answer.
+// Both kernels run in two rounds. The first round only considers tolerances above half
+// of the last choice, and can thus skip the tables of distant instances. The second
+// round considers all tolerances. It runs only if a smaller tolerance may be the
+// answer.
 
 #include "base/scan.cuh"
 #include "select/cut_parts.cuh"
@@ -15,12 +16,12 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kChooseThreads = 1024;
-// The number of bins that a warp of choose_kernel adds up.
+// Number of bins that a warp of choose_kernel sums.
 constexpr uint32_t kWarpBins = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads * 32;
 constexpr float kMostGuess = 1 << 20;
 
-// Counts, for each bin, by how many gaussians its cut differs from the cut of the
-// preceding bin.
+// Computes, for each bin, how many more gaussians its cut has than the cut of the bin
+// before.
 __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound round,
                               const unsigned* num_parts, Count* change) {
     if (round.is_over()) return;
@@ -58,9 +59,9 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
 }
 
 // Chooses the first bin from which on no cut exceeds the budget. With
-// BudgetPace::in_steps it may choose a later bin. If every cut exceeds the budget, it
-// sets the number of parts to 0, so that cut_kernel does nothing. Runs in a single
-// block.
+// BudgetPace::in_steps, it may choose a later bin. If every cut exceeds the budget, it
+// sets the number of parts to 0, so that cut_kernel does nothing. Launched with a
+// single block.
 __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
                               BudgetState* state, unsigned* num_parts) {
     if (round.is_over()) return;

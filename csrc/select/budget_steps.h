@@ -11,15 +11,15 @@
 
 namespace v3dg {
 
-// The last tolerance of a budget, and for how many pictures nothing has moved. Copies
-// are independent.
+// The last tolerance of a budget, and the number of pictures for which nothing has
+// moved. Copies are independent.
 class BudgetSteps {
   public:
-    // State of tolerance_of_budget(), if it is kept on the host.
+    // State of tolerance_of_budget() if it is kept on the host.
     uint32_t last_bin = kNoBin;
 
-    // Returns the rule for the next picture. A changed scene must be a new object.
-    // Without a fade, the rule is returned unchanged.
+    // Returns the rule for the next picture. `scene` must be a new object after each
+    // change of the scene. Without a fade, the rule is returned unchanged.
     SelectRule next(SelectRule rule, const Eyes& eyes, const std::shared_ptr<const void>& scene) {
         if (!rule.fade.is_on()) return rule;
         const bool is_same_scene = !scene_.owner_before(scene) && !scene.owner_before(scene_);
@@ -38,14 +38,15 @@ class BudgetSteps {
     bool has_begun_ = false;
     SelectRule rule_{};
     Eyes eyes_;
-    // Does not keep the scene alive, but ensures that its address is not reused.
+    // A weak pointer does not keep the scene alive, but ensures that its address is not
+    // reused.
     std::weak_ptr<const void> scene_;
     int32_t frames_at_rest_ = 0;
 };
 
 // Calls body(rule, last_bin) for the next picture of a sequence, and returns its
-// result. `steps` is the state of the sequence, which stays unchanged if body throws.
-// If `steps` is null, the picture is the only one, and the rule is unchanged.
+// result. `steps` is the state of the sequence; if body throws, it is not changed. If
+// `steps` is null, there is only one picture, and the rule is not changed.
 template <class Body>
 auto in_steps(BudgetSteps* steps, const SelectRule& rule, const Eyes& eyes,
               const std::shared_ptr<const void>& scene, const Body& body) {

@@ -1,11 +1,11 @@
-// The cut of a batch. The cut of each camera is equal to the cut that cut_cuda.cu
+// Computes the cut of a batch. The cut of each camera equals the one that cut_cuda.cu
 // computes for that camera alone. The number of kernels is the same as for a single
 // camera.
 //
 // place_batch_kernel has a thread for each slot of each camera, and each block belongs
-// to one camera. Slots are aligned to blocks. So the lanes of a warp have the same
-// instances as in the cut of a single camera, and the same adjacent instances share
-// items. cut_kernel then tests the parts of all cameras.
+// to one camera. Slots are aligned to blocks. Therefore a warp has the same instances
+// as in the cut of a single camera, and the same adjacent instances share items.
+// cut_kernel then tests the parts of all cameras.
 
 #include <algorithm>
 
@@ -33,8 +33,9 @@ __device__ FrameImage image_of(const BatchViews& views, const Camera& camera, ui
     return image;
 }
 
-// One thread per place. The sides of frusta are computed for each instance, because
-// tables for each camera and bundle could be larger than the instances.
+// Launched with one thread per place. Each thread computes the sides of the frustum
+// itself, because a table for all cameras and bundles could be larger than the
+// instances.
 __global__ void __launch_bounds__(kPlaceThreads, kPlaceBlocks / 2)
     place_batch_kernel(PlacedScene scene, EnvironmentTable environments, BatchViews views,
                        SelectRule rule, BatchPlacements out, int32_t* bundle_of_place,

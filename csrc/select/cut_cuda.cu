@@ -1,15 +1,15 @@
 // Selects the cut of a scene on the device, in two kernels.
 //
-// place_kernel has a thread per instance (place_instances.cuh). A thread transforms the
-// camera into the frame of its instance, and chooses the source of the instance's cut:
-// nothing, the top clusters, or the whole table. The kernel divides the work into parts
-// for cut_kernel. A part is one of three things: up to 256 clusters of one table that
-// bounds could not exclude; the top clusters of up to 32 consecutive instances; or the
-// last clusters of such instances' tables, if one lane per instance suffices.
+// place_kernel has one thread per instance (place_instances.cuh). It transforms the
+// camera into the coordinates of the instance, and chooses the source of the instance's
+// cut: nothing, the top clusters, or the whole table. It also divides the work into
+// parts for cut_kernel. A part is one of three things: up to 256 clusters of one table
+// that bounds could not exclude; the top clusters of up to 32 consecutive instances; or
+// the last clusters of such instances' tables, if one lane per instance suffices.
 //
 // A block of cut_kernel processes up to eight parts, one per warp. It tests which
 // clusters are drawn (cut_parts.cuh), records which pages they need (page_needs.cuh),
-// and writes the drawn clusters at positions given by a prefix sum
+// and writes the drawn clusters to positions that a prefix sum gives
 // (write_clusters.cuh).
 //
 // With a budget, place_kernel and the kernels of budget_cuda.cu run in two rounds
@@ -32,8 +32,8 @@
 namespace v3dg {
 namespace cuda {
 
-// The optional outputs of a cut: the choice of a budget, and the pictures and
-// placements of a frame. Pointers are null if not requested.
+// Optional outputs of a cut: the choice of a budget, and the pictures and placements of
+// a frame. A pointer is null if its output is not requested.
 struct Cut::Target {
     EyeImages pictures;
     FrameImage* images;
@@ -51,7 +51,7 @@ __global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, 
     if (b < num_bundles) sides[b] = sides_of_eyes(eyes, bundles[b].table.pad_px);
 }
 
-// One thread per instance. `kAreTwo`: there are two eyes.
+// Launched with one thread per instance. `kAreTwo` means that there are two eyes.
 template <bool kAreTwo>
 __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kPlaceBlocks)
     place_kernel(PlacedScene scene, Eyes eyes, BundleSides sides, SelectRule rule,
@@ -73,7 +73,7 @@ __global__ void report_kernel(NeedList needs, SelectRule rule, const CutChoice* 
     report_needs(needs, rule, choice);
 }
 
-// One thread per instance.
+// Launched with one thread per instance.
 __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage image,
                                  FrameImage* images, Placement* placements) {
     const size_t i = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
@@ -84,7 +84,7 @@ __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage im
         placement_of(axes_of_instance(camera, pose), pose, scene.instances.bundle[i], 0);
 }
 
-// One thread per pair. Skips pairs whose instance is not drawn.
+// Launched with one thread per pair. Skips pairs whose instance is not drawn.
 template <class Output>
 __global__ void __launch_bounds__(kCutThreads)
     given_kernel(PlacedScene scene, GivenCut given, CutScratch scratch, Output output) {
@@ -248,7 +248,8 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
     const bool has_budget = rule.budget != kNoBudget;
     const bool keeps_bin = has_budget && last_bin != nullptr;
     uint32_t* bin_on_device = keeps_bin ? &budget_state(stream)->last_bin : nullptr;
-    // Repeat with larger buffers if the pairs do not fit. Most cuts fit the first time.
+    // If the pairs do not fit, repeat the cut with larger buffers. Most cuts fit the
+    // first time.
     for (Count capacity = std::max<Count>(1u << 16, pair_instance_.capacity());;
          capacity = counts.pairs) {
         const PairOutput<kFades> output{

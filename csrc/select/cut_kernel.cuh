@@ -1,7 +1,7 @@
 #pragma once
 
-// The second kernel of a cut. It tests the clusters of parts, and writes the clusters
-// that are drawn.
+// The second kernel of a cut. It tests the clusters of parts, and writes those that are
+// drawn.
 
 #include "base/scan.cuh"
 #include "select/cut_parts.cuh"
@@ -13,10 +13,10 @@ namespace v3dg {
 namespace cuda {
 
 constexpr unsigned kCutBlocks = 4;  // resident blocks of cut_kernel per multiprocessor
-// Resident blocks of place_kernel per multiprocessor.
+// resident blocks of place_kernel per multiprocessor
 constexpr unsigned kPlaceBlocks = 12;
 
-// Tests and writes clusters. `kTells`: the kernel records which pages are needed.
+// Tests and writes clusters. If `kTells`, it also records which pages are needed.
 template <class Output, bool kTells>
 static __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice,

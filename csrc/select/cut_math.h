@@ -16,8 +16,8 @@ namespace v3dg {
 
 // Returns whether the cut of an instance consists of the top clusters, each with weight
 // 1. Such a cut depends on no page. All top groups are tested. The paper's footprint is
-// excluded: it may decrease towards the root, so that a group below a fitting top group
-// may be refined.
+// excluded: it may decrease towards the root, so a group below a fitting top group
+// could be refined.
 V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view,
                              const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
@@ -26,14 +26,14 @@ V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view
     return true;
 }
 
-// The clusters that the cut of an instance can contain.
+// Which clusters the cut of an instance can contain.
 enum class CutSource {
-    nowhere,  // none: the instance is hidden
+    nowhere,  // none, because the instance is hidden
     tops,     // the top clusters, which no group replaces
     table,    // all clusters of the table
 };
 
-// Returns whether the whole instance is outside of the frustum.
+// Returns whether the whole instance is outside the frustum.
 V3DG_HD inline bool is_hidden(const ClusterTable& table, const InstanceView& view,
                               const SelectRule& rule) {
     return rule.culls && is_outside(table.bounds, view);
@@ -55,7 +55,7 @@ struct BinRange {
     V3DG_HD bool is_empty() const { return first >= end; }
 };
 
-// Computes the state of a group at each call. The bins of a budget assume that all
+// Computes the state of a group anew at each call. The bins of a budget assume that all
 // pages are resident, so that the tolerance does not depend on residency.
 struct AskedGroups {
     const ClusterTable& table;
@@ -78,8 +78,8 @@ struct AskedGroups {
     }
 };
 
-// The decision about each cluster of one instance. `Groups` is AskedGroups, or a type
-// with the same members that looks up stored results.
+// Decides about each cluster of one instance. `Groups` is AskedGroups, or a type with
+// the same members that looks up stored results.
 template <class Groups>
 struct InstanceCut {
     const ClusterTable& table;
@@ -116,7 +116,7 @@ struct InstanceCut {
     }
 };
 
-// Returns the decisions of an instance, with the states of groups computed at each
+// Returns the decisions of an instance. The states of groups are computed anew at each
 // call.
 V3DG_HD inline InstanceCut<AskedGroups> cut_by_asking(const ClusterTable& table,
                                                       const InstanceView& view,

@@ -11,37 +11,37 @@ namespace cuda {
 
 using Count = unsigned long long;
 
-// Clusters per lane in a part of a table.
+// Number of clusters per lane in a part of a table.
 constexpr unsigned kLaneClusters = kClustersOfBounds;
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte has one bit per cluster of a lane");
 static_assert(kPartSize == kClustersOfPart, "scenes bound the number of parts");
 
-// The work of one warp. If `lanes` is 0, the part is clusters [first, first +
-// kPartSize) of one instance. Otherwise each set bit k of `lanes` means that lane k
-// processes the instance at place + k: its top clusters, or the last clusters of its
-// table.
+// The work of one warp. If `lanes` is 0, the part consists of the clusters [first,
+// first + kPartSize) of one instance. Otherwise, each set bit k of `lanes` assigns the
+// instance at place + k to lane k, which processes its top clusters or the last
+// clusters of its table.
 struct CutPart {
     uint32_t place, first, lanes;
 };
 
-// Returns where the last clusters of a table begin: the coarsest ones, which are few
-// enough for one lane to test.
+// Returns the index at which the last clusters of a table begin. These are the coarsest
+// ones, few enough that one lane can test them.
 __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene, and what place_kernel writes about its instances. With one viewpoint, the
-// place of an instance is its index. A batch has a place for each instance of each
-// camera.
+// A scene, and the data about its instances that place_kernel writes. With one
+// viewpoint, the place of an instance is its index. A batch has a place for each
+// instance of each camera.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     const int32_t* bundle_of_place;
-    InstanceView* views;  // set for instances whose tables are tested
-    // One byte per instance that a single lane processes: one bit per drawn top
-    // cluster, or 0 if the lane tests the last clusters of the table.
+    InstanceView* views;  // written for instances whose tables are tested
+    // One byte for each instance that a single lane processes. It has one bit per drawn
+    // top cluster, or is 0 if the lane tests the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
@@ -49,13 +49,14 @@ struct PlacedScene {
 // The state that the search for a budget's tolerance keeps for the next frame.
 struct BudgetState {
     float guess = 0.0f;          // a tolerance that is probably below the next choice
-    unsigned again = 0;          // nonzero if the guess was too high: the second round must run
+    unsigned again = 0;          // nonzero if the guess was too high, so that the
+                                 // second round must run
     uint32_t last_bin = kNoBin;  // state of tolerance_of_budget()
 };
 
 // A round of the search for a budget's tolerance. The first round considers tolerances
-// from the guess on; the second, all tolerances. Without a budget there is only one
-// round, and `state` is null.
+// from the guess on, and the second one all tolerances. Without a budget, there is only
+// one round, and `state` is null.
 struct BudgetRound {
     const BudgetState* state;
     bool is_second;
@@ -68,15 +69,16 @@ struct BudgetRound {
     }
 };
 
-// Enqueues one round of choosing the tolerance. `change` must have kNumBudgetBins zeros
-// before the first round. `num_parts` is in device memory, and becomes 0 if no cut fits
-// the budget.
+// Enqueues one round of choosing the tolerance. Before the first round, `change` must
+// have kNumBudgetBins zeros. `num_parts` is in device memory, and is set to 0 if no cut
+// fits the budget.
 void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// The weights of a lane's clusters, 16 bits each, from the lowest bits up. Weights are
-// read by shifting. Indexing an array would move it from registers to memory.
+// The weights of a lane's clusters, 16 bits each, beginning at the lowest bits. Weights
+// are read by shifting, because indexing an array would move it from registers to
+// memory.
 struct alignas(16) LaneWeights {
     uint64_t low, high;
 
@@ -90,15 +92,14 @@ struct alignas(16) LaneWeights {
 };
 static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "LaneWeights holds eight weights of 16 bits");
 
-// The clusters of a part that one lane processes. All belong to one instance. Bit k of
-// `drawn` is set if the k-th cluster is drawn. Weights are set only in cuts with a
-// fade.
+// The clusters of a part that one lane processes. All of them belong to one instance.
+// Bit k of `drawn` is set if the k-th cluster is drawn. Weights are only set in cuts
+// with a fade.
 struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t place;  // place of the instance
     uint32_t first;  // index of the first cluster in the table
-    // True if each lane has its own instance; false if all lanes have the same
-    // instance.
+    // True if each lane has its own instance; false if all lanes have the same one.
     bool is_alone;
     bool are_tops;
     unsigned drawn;
@@ -107,7 +108,7 @@ struct LaneClusters {
     __device__ int32_t cluster(unsigned k) const {
         return are_tops ? bundle->table.top_cluster[k] : static_cast<int32_t>(first + k);
     }
-    // Returns the number of gaussians in `count` clusters, from the k-th on.
+    // Returns the number of gaussians in `count` clusters, beginning with the k-th.
     __device__ unsigned size(unsigned k, unsigned count = 1) const {
         const int32_t c = cluster(k);
         return static_cast<unsigned>(bundle->table.offset[c + count] - bundle->table.offset[c]);
@@ -140,8 +141,8 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
 
 // Tests the clusters of a block's parts that come from tables. All threads of the block
 // must call it. A lane is an owner if the bounds of its clusters do not exclude all of
-// them. The warps share the tests of all owners, a lane per cluster and four owners at
-// a time, so that no warp waits long for a warp with more owners.
+// them. The warps share the tests of all owners, with one lane per cluster and four
+// owners at a time, so that no warp waits long for another one that has more owners.
 //
 // Sets bit k of an owner's `drawn` if ask(bundle, view, cluster) is positive for its
 // k-th cluster. With `kKeepsWeights`, it also stores the values in `weights`.
@@ -149,8 +150,9 @@ template <bool kKeepsWeights, class Ask>
 __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
-        const BundleOnDevice* bundle;  // null if each lane has another instance
-        // First cluster; if `bundle` is null, place of the instance of the first lane.
+        const BundleOnDevice* bundle;  // null if each lane has a different instance
+        // The first cluster or, if `bundle` is null, the place of the first lane's
+        // instance.
         uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];

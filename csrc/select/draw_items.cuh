@@ -1,14 +1,15 @@
 #pragma once
 
-// The output lists of a cut: pairs, or the items of a frame. A lane counts its elements
-// first. A prefix sum over all lanes then gives the position at which it writes them.
+// The output lists of a cut: pairs, or the items of a frame. A lane first counts its
+// elements. A prefix sum over all lanes then gives the position at which the lane
+// writes them.
 
 #include "select/cut_parts.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// The amount that a lane will write.
+// How much a lane will write.
 struct WriteCount {
     unsigned units, gaussians;  // `units`: number of list elements
 };
@@ -46,9 +47,9 @@ struct PairOutput {
     }
 };
 
-// One drawn element: adjacent clusters of the lane's instance; or, if `sharers` is not
-// 0, one cluster of several instances. Bit j of `sharers` stands for instance j of the
-// part.
+// One drawn element. If `sharers` is 0, it consists of adjacent clusters of the lane's
+// instance. Otherwise it is one cluster of several instances, and bit j of `sharers` is
+// set for instance j of the part.
 struct DrawnRun {
     unsigned k, num_clusters;
     uint32_t sharers;
@@ -57,18 +58,18 @@ struct DrawnRun {
     __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
 };
 
-// Returns whether a warp draws a cluster of several instances faster as a shared item.
-// In a shared item it processes the gaussians one by one, each for all instances at
-// once. Otherwise it processes the instances one by one, 32 gaussians at a time;
-// starting an item costs as much as two such steps.
+// Returns whether a warp draws one cluster of several instances faster as a shared
+// item. In a shared item, it processes the gaussians one by one, each for all instances
+// at once. Otherwise, it processes the instances one by one, 32 gaussians at a time.
+// Starting an item costs as much as two such steps.
 __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
     return num_instances > 1 &&
            num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
 // Calls visit(DrawnRun) for each drawn element, in the lane that writes it. All lanes
-// of the warp must call it. With a fade, adjacent clusters of different weights are
-// separate.
+// of the warp must call it. With a fade, adjacent clusters with different weights are
+// separate elements.
 template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.is_alone) {
@@ -101,9 +102,9 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     }
 }
 
-// The list of selected clusters as items of a frame. Adjacent clusters of an instance
-// share an item, and so may consecutive instances of one coarse cluster. Each item is
-// written once per picture.
+// The selected clusters as items of a frame. Adjacent clusters of an instance share an
+// item, and so may consecutive instances of one coarse cluster. Each item is written
+// once per picture.
 template <bool kHasFade>
 struct ItemOutput {
     static constexpr bool kFades = kHasFade;

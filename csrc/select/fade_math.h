@@ -27,9 +27,9 @@ V3DG_HD inline float share_of(int32_t weight) {
     return static_cast<float>(weight) * (1.0f / kWhole);
 }
 
-// Returns how far a group is refined: 0 if it fits, kWhole if it is refined, and a
-// linear ramp in between. The result never decreases as the metric grows, because each
-// step of the computation is monotonic.
+// Returns how far a group is refined: 0 if it fits, kWhole if it is refined completely,
+// and a linear ramp in between. The result never decreases as the metric grows, because
+// each step of the computation is monotonic.
 V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
     const float low = rule.tolerance_px2 * rule.fade.inverse,
                 high = rule.tolerance_px2 * rule.fade.factor;
@@ -41,8 +41,8 @@ V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
 }
 
 // Returns how far the page of a group has faded in, from 0 to kWhole. The refinement of
-// the group is limited to this value. Neither the refinement nor this value decreases
-// towards the root, so their minimum does not decrease either, and the cut stays exact.
+// the group is limited to this value. Neither of them decreases towards the root, so
+// their minimum does not decrease either, and the cut stays exact.
 V3DG_HD inline int32_t arrival(const PageTable& pages, int32_t g, const SelectRule& rule) {
     static_assert(kWhole % kArrivalFrames == 0,
                   "kWhole must be a multiple of the number of frames");

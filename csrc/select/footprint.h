@@ -1,11 +1,11 @@
 #pragma once
 
-// The footprint of a ball: the screen area that it covers. Also the metric of a group:
-// footprint times weight.
+// The footprint of a ball, which is the screen area that it covers; and the metric of a
+// group, which is footprint times weight.
 //
 // Decisions depend on every bit of the footprint, so this file is compiled without
 // floating-point contraction. The footprint never decreases when a ball grows
-// (math/solid_angle.h). The factor px2_per_steradian is one number per camera
+// (math/solid_angle.h). A camera contributes a single factor, px2_per_steradian
 // (camera/camera.h).
 
 #include <cmath>
@@ -28,16 +28,16 @@ V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
     return view.has_other_eye ? min_of(distance2, distance2_from(view.other_eye, ball)) : distance2;
 }
 
-// Returns the screen area, px², of a ball. `distance2` is the squared distance between
-// the eye and the ball's centre.
+// Returns the screen area, px², of a ball. `distance2` is the squared distance from the
+// eye to the ball's centre.
 V3DG_HD inline float footprint_at(float radius, float distance2, const InstanceView& view) {
     const float x2 = radius * radius / distance2;
     const float area = solid_angle_of_ball(x2) * view.px2_per_steradian;
     return x2 < 1.0f ? area : INFINITY;
 }
 
-// Returns the screen area, px², that a ball covers. The area is infinite if the eye is
-// inside the ball, or if the result would be NaN.
+// Returns the screen area, px², that a ball covers. It is infinite if the eye is inside
+// the ball, or if the computation gives NaN.
 V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view,
                                    Footprint footprint) {
     if (footprint == Footprint::solid_angle)
@@ -51,17 +51,18 @@ V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view,
 }
 
 // Returns the metric of group g, as if all pages were resident: the screen area, px²,
-// per gaussian of the clusters that the group made. Returns 0, so that the group always
-// fits, if the rule allows no finer level.
+// per gaussian of the clusters that the group made. Returns 0 if the rule does not
+// allow a finer level, so that the group always fits.
 V3DG_HD inline float wanted_metric_px2(const ClusterTable& table, int32_t g,
                                        const InstanceView& view, const SelectRule& rule) {
     const float metric = footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
     return table.level[g] <= rule.min_level ? 0.0f : metric;
 }
 
-// Returns the metric of group g that the cut uses: 0, so that the group always fits, if
-// the page with the finer clusters is not resident. Residency never decreases towards
-// the root, like the metric itself, so the cut stays exact.
+// Returns the metric of group g for the cut. It is 0 if the page with the finer
+// clusters is absent, so that the group always fits. Pages above a resident page are
+// resident, so this metric does not decrease towards the root either, and the cut stays
+// exact.
 V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
                                 const SelectRule& rule) {
     return table.pages.is_resident(g) ? wanted_metric_px2(table, g, view, rule) : 0.0f;

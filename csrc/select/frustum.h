@@ -13,9 +13,8 @@ namespace v3dg {
 // The position of a box relative to a plane, in units of the length of the plane's
 // normal.
 struct PlaneSide {
-    float nearest, farthest;  // signed distances of the nearest and farthest corner
-    // The distance by which gaussians may extend beyond the box, plus a margin for
-    // rounding.
+    float nearest, farthest;  // signed distances of the nearest and the farthest corner
+    // How far gaussians may extend beyond the box, plus a margin for rounding.
     float reach;
 };
 
@@ -34,8 +33,7 @@ V3DG_HD inline PlaneSide side_of(const Box& box, const InstanceView& view, int p
             plane.guard * half_depth + 16.0f * FLT_EPSILON * terms};
 }
 
-// Returns true only if no gaussian in the box can touch a pixel. Returns false if a
-// number is NaN.
+// Returns true only if no gaussian in the box can touch a pixel. NaN gives false.
 V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
     for (int p = 0; p < kNumPlanes; ++p) {
         const PlaneSide side = side_of(box, view, p);
@@ -44,8 +42,8 @@ V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
     return false;
 }
 
-// Returns true only if is_outside() is false for every box inside this one. Returns
-// false if a number is NaN.
+// Returns true only if is_outside() is false for every box inside this one. NaN gives
+// false.
 V3DG_HD inline bool is_inside(const Box& box, const InstanceView& view) {
     for (int p = 0; p < kNumPlanes; ++p) {
         const PlaneSide side = side_of(box, view, p);

@@ -1,6 +1,6 @@
 #pragma once
 
-// The camera in the coordinates of an instance, which is all that selection reads of a
+// The camera in the coordinates of an instance. Selection reads nothing else about a
 // camera.
 
 #include "camera/camera.h"
@@ -12,30 +12,31 @@ namespace v3dg {
 constexpr int kNumPlanes = Intrinsics<double>::kNumPlanes;
 
 // A camera, or two eyes, in the coordinates and units of one instance. With two eyes,
-// distances are measured to the nearer eye, and the planes enclose both frusta. The
-// alignment lets a thread access the struct in few instructions.
+// distances are measured to the nearer eye, and the planes enclose both frusta. Because
+// of its alignment, a thread can load the struct in few instructions.
 struct alignas(16) InstanceView {
     float eye[3], other_eye[3];
     bool has_other_eye;
-    // Viewing direction of a pinhole, unit length; the guard direction of other models.
+    // The viewing direction of a pinhole camera as a unit vector. For other models, it
+    // is the guard direction.
     float forward[3];
     float px2_per_steradian;  // the camera's value times the instance's importance
-    Plane plane[kNumPlanes];  // a gaussian outside of any plane is not drawn
+    Plane plane[kNumPlanes];  // a gaussian outside any of these planes is not drawn
 };
 
 // The side planes of a frustum in camera coordinates, around both eyes. They are the
 // same for all instances of a bundle.
 using CameraSides = Intrinsics<double>::Sides;
 
-// Returns the side planes around the requested part of the image, moved outwards by
-// pad_px.
+// Returns the side planes around the drawn part of the image. They are moved outwards
+// by pad_px.
 V3DG_HD inline CameraSides sides_of_eyes(const Eyes& eyes, double pad_px) {
     return Intrinsics<double>::sides_of(eyes.camera, eyes.count(), pad_px);
 }
 
-// Transforms the camera into the coordinates of an instance. `in` are the axes of the
-// first eye; `sides` belong to the instance's bundle. The function is compiled without
-// floating-point contraction, so that the CPU and CUDA compute the same bits.
+// Transforms the camera into the coordinates of an instance. `in` has the axes of the
+// first eye, and `sides` belong to the instance's bundle. The function is compiled
+// without floating-point contraction, so that the CPU and CUDA compute the same bits.
 V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const CameraSides& sides,
                                                const InstanceAxes& in, const Pose& pose,
                                                float importance) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// Finds the pages that a cut needs, and their priorities. The functions are used when
-// only some pages of a bundle are resident.
+// Finds the pages that a cut needs, and their priorities. Used if only some pages of a
+// bundle are resident.
 
 #include <cfloat>
 #include <cmath>
@@ -14,20 +14,20 @@
 namespace v3dg {
 
 // Returns the priority of a group's page. It is above 1 if the cut would refine the
-// group, and at most 1 if only a cut with a smaller tolerance would refine it. A fade
+// group. It is at most 1 if only a cut with a smaller tolerance would refine it. A fade
 // raises the priority.
 V3DG_HD inline float priority_of(float metric_px2, const SelectRule& rule) {
     const float ratio = metric_px2 * rule.fade.factor / rule.tolerance_px2;
     if (fits(metric_px2, rule)) return ratio <= 1.0f ? ratio : 0.0f;
     return ratio > 1.0f ? ratio : 1.0f + FLT_EPSILON;
 }
-// Pages with at least this priority are requested. A page that the cut needs now has a
-// priority above 1, so pages are requested before the cut needs them.
+// Pages with at least this priority are requested. Pages that the cut needs now have a
+// priority above 1, so other pages are requested before a cut needs them.
 constexpr float kLeastPriority = 0.5f;
 
 // A page that a cut needs.
 struct PageNeed {
-    int32_t page;  // -1: no page
+    int32_t page;  // -1 if no page is needed
     float priority;
 };
 
@@ -35,11 +35,11 @@ struct PageNeed {
 // culled. The pages above that page are needed, too. priority(g) returns the priority
 // of group g's page.
 //
-// When all pages with a priority above 1 are resident, and all pages above them, the
-// cut is the same as if every page were resident. A cluster that is drawn in place of
-// finer clusters requests their page, even if that page is already resident. Otherwise
-// a page whose clusters are all culled would be needed only while it is absent, and
-// would be loaded and evicted again and again.
+// If all pages with a priority above 1 are resident, and all pages above them, the cut
+// is the same as if every page were resident. A cluster that is drawn in place of finer
+// clusters requests their page, even if that page is already resident. Without this
+// rule, a page whose clusters are all culled would count as needed only while it is
+// absent; it would be loaded and evicted again and again.
 template <class Priority>
 V3DG_HD inline PageNeed page_need(const ClusterTable& table, size_t c, const Priority& priority) {
     const int32_t own = table.own_group[c], parent = table.parent_group[c];

@@ -16,7 +16,7 @@ __device__ inline void tell_need(const InstanceCut<AskedGroups>& cut, int32_t c,
     });
     if (need.page < 0 || cut.is_culled(c)) return;
     uint32_t* word = needs.need[bundle] + need.page;
-    // The bits of positive floats compare like the floats.
+    // Bits of positive floats have the same order as the floats.
     const uint32_t bits = __float_as_uint(need.priority);
     if (*static_cast<volatile uint32_t*>(word) >= bits || atomicMax(word, bits) != 0) return;
     const unsigned place = atomicAdd(needs.words, 1u);
@@ -25,8 +25,8 @@ __device__ inline void tell_need(const InstanceCut<AskedGroups>& cut, int32_t c,
             .bundle = bundle, .page = static_cast<uint32_t>(need.page), .priority = 0.0f};
 }
 
-// Writes the list of needed pages to host memory, one thread per page. A warp writes
-// consecutive words, because scattered writes to host memory are slow.
+// Writes the list of needed pages to host memory, with one thread per page. A warp
+// writes consecutive words, because scattered writes to host memory are slow.
 __device__ inline void report_needs(const NeedList& needs, const SelectRule& rule,
                                     const CutChoice* choice) {
     constexpr unsigned kWords = sizeof(PageRequest) / sizeof(uint32_t);

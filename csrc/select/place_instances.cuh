@@ -1,7 +1,8 @@
 #pragma once
 
-// Transforms the cameras into the frame of each instance, chooses the source of the
-// instance's cut, and divides the work into parts. One thread per instance.
+// Transforms the cameras into the coordinates of each instance, chooses the source of
+// the instance's cut, and divides the work into parts. There is one thread per
+// instance.
 
 #include "base/scan.cuh"
 #include "select/cut_scratch.cuh"
@@ -14,9 +15,9 @@ constexpr unsigned kFewBundles = 8;
 // parts occupy the whole device.
 constexpr unsigned kFewInstances = 8192, kFewLanes = 8;
 
-// The frustum sides for each bundle. Computing them per instance instead would cost
-// eight divisions of doubles. Few bundles fit into a kernel argument; more are in
-// memory.
+// The frustum sides for each bundle. Computing them for each instance would cost eight
+// divisions of doubles. If there are only a few bundles, their sides are passed as a
+// kernel argument, and otherwise in memory.
 struct BundleSides {
     CameraSides few[kFewBundles];
     const CameraSides* many;  // null if `few` is used
@@ -35,15 +36,15 @@ __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& p
             .image = image};
 }
 
-// One record per lane of a warp, in shared memory, so that the warp writes them to
-// global memory with coalesced stores.
+// Records in shared memory, one per lane of a warp. They let the warp write to global
+// memory with coalesced stores.
 template <class Record>
 struct RecordRow {
     Record* records;
 
     __device__ void set(const Record& mine) const { records[threadIdx.x % 32] = mine; }
-    // Writes the records of the lanes with `has_one` to consecutive positions from
-    // `first` on. All lanes of the warp must call it.
+    // Writes the records of the lanes with `has_one` to consecutive positions,
+    // beginning at `first`. All lanes of the warp must call it.
     __device__ void write(bool has_one, Record* first) const {
         constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
         static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
@@ -58,7 +59,7 @@ struct RecordRow {
             const unsigned v = 32 * k + threadIdx.x % 32;
             if (writers >> v / kVectors & 1) to[v] = from[v];
         }
-        __syncwarp();  // later calls of set() overwrite the records
+        __syncwarp();  // set() overwrites the records
     }
 };
 
@@ -69,17 +70,17 @@ struct Placed {
     bool is_alone;       // whether a single lane tests these clusters
 };
 
-// The instance of a thread.
+// The instance that a thread processes.
 struct InstanceSlot {
     bool is_taken;    // whether the thread has an instance
     size_t instance;  // index of the instance in the scene
-    size_t place;     // where the results are written; consecutive in a warp
+    size_t place;     // index at which results are written; consecutive in a warp
     unsigned image;   // image of the first eye
 };
 
 // Places an instance: writes its view, its placements and its top clusters. All lanes
-// of the warp must call it. `sides_of` returns the frustum sides for a bundle. With n
-// instances, instance i has the placement n + i in front of a second eye.
+// of the warp must call it. `sides_of` returns the frustum sides of a bundle. With n
+// instances, instance i has placement n + i in front of a second eye.
 template <class SidesOf>
 __device__ inline Placed place_instance(const PlacedScene& scene, const InstanceSlot& slot,
                                         const Eyes& eyes, const SidesOf& sides_of,
@@ -106,8 +107,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, const Instance
             const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
             view = view_from_instance(eyes, sides_of(bundle), axes, pose,
                                       scene.instances.importance[i]);
-            // Store the placement now, before it is known whether the instance is
-            // visible. Then its axes need no registers any more.
+            // Store the placement before the instance is known to be visible. This
+            // frees the registers of its axes.
             if (placements != nullptr)
                 placement_row.set(placement_of(axes, pose, bundle, slot.image));
         }
@@ -120,8 +121,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, const Instance
             scene.tops[slot.place] = static_cast<uint8_t>(drawn);
             if (drawn == 0) source = CutSource::nowhere;
         }
-        // With a budget, the tolerance is not known yet, so the bounds must hold for
-        // all larger tolerances as well.
+        // With a budget, the tolerance is not known yet, so the bounds must also hold
+        // for all larger tolerances.
         if (source == CutSource::table) {
             asked = clusters_to_ask(
                 table, scene.bundles[bundle].runs, view, rule,
@@ -146,14 +147,14 @@ __device__ inline Placed place_instance(const PlacedScene& scene, const Instance
     return {.source = source, .asked = asked, .is_alone = is_alone};
 }
 
-// Writes the parts of a block's instances behind the parts of earlier blocks, and
-// clears the states of cut_kernel. All threads of the block must call it. Returns the
-// number of parts up to and including this block.
+// Writes the parts of a block's instances after those of earlier blocks, and clears the
+// states of cut_kernel. All threads of the block must call it. Returns the number of
+// parts up to and including this block.
 //
-// Consecutive instances form one part if a single lane can process each of them, unless
-// an instance with a full table is between them. The thread of the first instance
-// writes the part. `place` is the place of the thread's instance. `num_instances` is
-// the number of instances of its viewpoint.
+// Consecutive instances form one part if a single lane can process each of them, and no
+// instance with a full table is between them. The thread of the first instance writes
+// the part. `place` is the place of the thread's instance. `num_instances` is the
+// number of instances of its viewpoint.
 __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
                                        size_t place, size_t num_instances,
                                        const CutScratch& scratch) {
@@ -195,7 +196,7 @@ __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& p
     // Clear the states of all tickets that cut_kernel may use. If a ticket has
     // kCutWarps parts, each block clears the tickets whose first part belongs to the
     // block. If a ticket has fewer parts, there are at most num_places tickets, and all
-    // blocks together clear them.
+    // blocks clear them together.
     const auto clear = [&](unsigned first, unsigned end, unsigned step) {
         for (unsigned t = first; t < end; t += step)
             scratch.unit_state[t] = scratch.count_state[t] = 0;

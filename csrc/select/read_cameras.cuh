@@ -13,7 +13,7 @@ __device__ inline double number_of(const void* numbers, bool are_double, size_t 
                       : static_cast<double>(static_cast<const float*>(numbers)[i]);
 }
 
-// Returns the environment of a camera. If the number is invalid, returns an environment
+// Returns the environment of a camera. For an invalid number, returns an environment
 // that no scene has.
 __device__ inline int32_t environment_of(const CameraArrays& arrays, uint32_t b) {
     if (arrays.environments == nullptr) return kSeesAll;

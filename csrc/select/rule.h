@@ -8,11 +8,12 @@
 
 namespace v3dg {
 
-// The measure of a ball's screen area.
+// How the screen area of a ball is measured.
 enum class Footprint {
-    // The ball's solid angle, which does not change when the camera rotates.
+    // The ball's solid angle. It does not change when the camera rotates.
     solid_angle,
-    paper,  // pi r² fx fy / depth², only for pinholes (Yang et al., SIGGRAPH 2025)
+    paper,  // pi r² fx fy / depth², only for pinhole cameras (Yang et al., SIGGRAPH
+            // 2025)
 };
 
 // The value of SelectRule::budget that means no limit.
@@ -29,13 +30,14 @@ struct Fade {
     }
 };
 
-// The way in which a budget determines the tolerance.
+// How a budget determines the tolerance.
 enum class BudgetPace {
-    at_once,  // from the current view alone
-    // Choose from the current view and the tolerance of the last frame, so that slow
-    // motion causes no sudden change (budget_steps.h).
+    at_once,  // The tolerance depends only on the current view.
+    // The tolerance depends on the current view and on the tolerance of the last frame,
+    // so that slow motion causes no sudden change (budget_steps.h).
     in_steps,
-    // Keep the tolerance unless the cut exceeds the budget; for drawing a frame again.
+    // The tolerance is kept unless the cut exceeds the budget. Used for drawing a frame
+    // again.
     again,
 };
 
@@ -43,17 +45,17 @@ enum class BudgetPace {
 struct SelectRule {
     float tolerance_px2;
     Footprint footprint = Footprint::solid_angle;
-    bool culls = true;      // leave out clusters that are outside of the frustum
+    bool culls = true;      // whether to omit clusters outside the frustum
     int32_t min_level = 0;  // finer levels are not drawn
-    // Largest number of gaussians; the tolerance is raised until the cut has no more.
+    // Maximum number of gaussians. If the cut has more, the tolerance is raised.
     uint64_t budget = kNoBudget;
     BudgetPace pace = BudgetPace::at_once;
-    // The number of frames without motion, including this one; for
-    // BudgetPace::in_steps.
+    // For BudgetPace::in_steps: the number of frames without motion, including this
+    // one.
     int32_t frames_at_rest = 0;
     Fade fade = {};  // must be off with Footprint::paper
-    // The index of the frame, which determines how far pages have faded in; for cuts
-    // with a fade.
+    // For cuts with a fade: the index of the frame, which determines how far pages have
+    // faded in.
     int32_t frame = 0;
 
     bool operator==(const SelectRule& o) const {

@@ -1,5 +1,5 @@
-// Selection on the CPU. Threads process chunks of instances. For an instance, the
-// refinement of each group is computed once; the clusters then look it up. So the
+// Selection on the CPU. Threads process chunks of instances. For each instance, the
+// refinement of each group is computed once, and the clusters then look it up. So the
 // decision about a cluster takes two passes (select_math.h).
 
 #include "select/select.h"
@@ -17,8 +17,8 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
-// The number of instances from which on the runs of a bundle are computed. Computing
-// the runs costs about as much as processing one instance.
+// From this number of instances on, the runs of a bundle are computed. Computing the
+// runs costs about as much as processing one instance.
 constexpr size_t kManyInstances = 16;
 
 // Stored states of the groups of one instance: how far each group is refined, and its
@@ -43,9 +43,10 @@ struct View {
     const SelectInput& in;
     std::vector<CameraSides> sides;  // one per bundle
     std::vector<ClusterRuns> own_runs;
-    // One per bundle, set by find_runs(); empty if there are few instances.
+    // One element per bundle, set by find_runs(). It is empty if there are few
+    // instances.
     Span<const ClusterRuns> runs;
-    size_t most_groups = 0, most_clusters = 0;  // largest numbers in any bundle
+    size_t most_groups = 0, most_clusters = 0;  // maxima over all bundles
 
     explicit View(const SelectInput& input) : in(input) {
         for (const ClusterTable& table : in.bundles) {
@@ -90,8 +91,8 @@ struct SeenInstance {
         return is_drawn ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
     }
 
-    // Returns the decisions of this instance. `groups` has the states of the groups,
-    // which may be filled in later.
+    // Returns the decisions of this instance. `groups` has the states of the groups;
+    // they may be filled in later.
     template <class Groups>
     InstanceCut<Groups> cut(const SelectRule& rule, const Groups& groups) const {
         return {table, view, rule, groups, rule.culls && !is_inside(table.bounds, view)};
@@ -106,8 +107,8 @@ struct SeenInstance {
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
-        // If most clusters must be tested, they belong to most groups. Then finding the
-        // range of these groups would cost more than testing all groups.
+        // If most clusters must be tested, they belong to most groups. Finding the
+        // range of these groups would then cost more than testing all groups.
         if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
         int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
         for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
@@ -133,10 +134,10 @@ struct Scratch {
           priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
-// Computes the refinement of an instance's groups. Passing the inputs by value shows
-// the compiler that no write changes them, so it vectorises the first loop. Tests of
-// residency would prevent vectorisation. So a second loop handles groups whose page is
-// absent or fading in.
+// Computes the refinement of an instance's groups. The inputs are passed by value,
+// which shows the compiler that no write changes them, so that it vectorises the first
+// loop. Testing for residency would prevent this, so a second loop handles groups whose
+// page is absent or fading in.
 template <Footprint footprint, bool kFades>
 void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
                 const ClusterRange asked, uint16_t* __restrict refinement) {
@@ -164,14 +165,14 @@ void ask_groups(const SeenInstance& seen, const SelectRule& rule, const ClusterR
         ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, asked, refinement);
 }
 
-// The first pass of the decision: writes the clusters with a positive weight, and
+// The first pass of the decision. Writes the clusters with a positive weight, and
 // returns their number.
 size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
                        const ClusterRange asked, const uint16_t* __restrict refinement,
                        int32_t* __restrict cluster) {
     const InstanceCut<KnownRefinements> cut{table, view, rule, {refinement}, false};
     size_t num_sufficient = 0;
-    // The loop has no branch, because the branch would often be mispredicted.
+    // The loop is branch-free, because a branch would often be mispredicted.
     for (size_t c = asked.first; c < asked.end; ++c) {
         cluster[num_sufficient] = static_cast<int32_t>(c);
         num_sufficient += cut.weight(c) > 0;
@@ -179,8 +180,8 @@ size_t find_sufficient(const ClusterTable table, const InstanceView view, const 
     return num_sufficient;
 }
 
-// Raises `need` to the bits of `priority`, unless it is higher already. Several threads
-// may do so concurrently. The bits of positive floats compare like the floats.
+// Raises `need` to the bits of `priority` if it is lower. Several threads may do so
+// concurrently. Bits of positive floats have the same order as the floats.
 void raise(uint32_t& need, float priority) {
     uint32_t bits, before = __atomic_load_n(&need, __ATOMIC_RELAXED);
     std::memcpy(&bits, &priority, sizeof bits);
@@ -233,8 +234,9 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     });
 }
 
-// Adds the cut of instance i to `change`: for each bin, by how many gaussians its cut
-// differs from the cut of the preceding bin. `bins` has room for all groups.
+// Adds the cut of instance i to `change`. For each bin, this adds the number of
+// gaussians by which the cut differs from that of the bin before. `bins` must have room
+// for all groups.
 void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
                     std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
@@ -261,8 +263,8 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
     }
 }
 
-// Several arrays whose sum is, for each bin, by how many gaussians its cut differs from
-// the cut of the preceding bin.
+// Several arrays. For each bin, their sum is the number of gaussians by which the cut
+// differs from that of the bin before.
 using BinChanges = std::vector<std::vector<int64_t>>;
 BinChanges count_changes(const View& view) {
     const size_t num_instances = view.in.instances.bundle.size;
@@ -279,7 +281,7 @@ BinChanges count_changes(const View& view) {
 }
 
 // Sets the tolerance of `rule` to meet its budget. Returns whether any cut fits. If
-// none does, `least_count` is the number of gaussians of the coarsest cut.
+// none fits, `least_count` receives the number of gaussians in the coarsest cut.
 bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
     const BinChanges changes = count_changes(view);
     const uint64_t goal_count = goal_of_budget(rule.budget);
@@ -349,7 +351,7 @@ void cpu::choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets,
     View view(in);
     view.find_runs();
     const BinChanges changes = count_changes(view);
-    // A step is a bin at which the number of gaussians changes. There are few steps.
+    // A bin at which the number of gaussians changes. There are few of these.
     struct Step {
         uint32_t bin;
         int64_t count;

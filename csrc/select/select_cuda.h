@@ -1,7 +1,7 @@
 #pragma once
 
-// Selection on CUDA: the interface. It computes the cut of a scene that is on the
-// device, as the items of a frame or as pairs.
+// Selection on CUDA. It computes the cut of a scene that is on the device, as items of
+// a frame or as pairs.
 
 #include "frame/draw_list.h"
 #include "frame/image.h"
@@ -14,37 +14,38 @@ namespace cuda {
 struct CutPart;
 struct BudgetState;
 
-// The head of a cut's report to the host about needed pages.
+// The head of a cut's report to the host about the pages that it needs.
 struct NeedsReport {
-    // Number of needed pages, including those for which the list has no room.
+    // Number of needed pages, including those that do not fit in the list.
     unsigned count;
     float tolerance_px2;
 };
 
-// The memory in which a cut collects the pages that it needs. It is on the device,
-// except for `report` and `reported`, which are in host memory.
+// The memory in which a cut collects the pages that it needs. `report` and `reported`
+// are in host memory, and the rest on the device.
 struct NeedList {
-    // The number of needed pages, then one element per page of all bundles. The cut
-    // clears this memory first.
+    // The number of needed pages, followed by one element per page of all bundles. The
+    // cut clears this memory first.
     uint32_t* words = nullptr;
     size_t num_words = 0;
-    uint32_t* const* need = nullptr;  // per bundle: its elements in `words`
+    uint32_t* const* need = nullptr;  // for each bundle, its elements in `words`
     PageRequest* list = nullptr;
     unsigned capacity = 0;  // largest length of `list` and of `reported`
     NeedsReport* report = nullptr;
     PageRequest* reported = nullptr;
 };
 
-// What a cut reads and requests in a pool, where only some pages are resident.
+// What a cut reads from a pool, in which only some pages are resident, and what it
+// reports to the pool.
 struct PartlyResident {
     const BundleOnDevice* bundles;
-    NeedList needs;  // `report` is null if no report is requested
+    NeedList needs;  // `report` is null if no report is wanted
 };
 
 // A camera of a batch on the device. A camera that is not drawn sees nothing.
 struct BatchCamera {
     Camera camera;
-    int32_t environment;  // as in EnvironmentTable
+    int32_t environment;  // as described at EnvironmentTable
     uint32_t is_drawn;
 };
 
@@ -52,11 +53,11 @@ struct BatchCamera {
 struct CameraArrays {
     // (B, 4, 4); (B, 3, 3), or (3, 3) for all cameras
     const void *viewmats, *intrinsics;
-    const void* environments;  // (B,); null if the cameras see all instances
+    const void* environments;  // (B,); null if each camera sees all instances
     // Whether an array has doubles, not floats; whether all cameras share the
     // intrinsics.
     bool are_viewmats_double, are_intrinsics_double, shares_intrinsics;
-    bool are_environments_long;  // int64, not int32
+    bool are_environments_long;  // whether they are int64 instead of int32
     int width, height;
     double near_depth;
 };
@@ -64,7 +65,8 @@ struct CameraArrays {
 // The source from which the cameras of a batch are read.
 enum class CameraSource {
     arrays,
-    // Copies; for a frame that is drawn again, because the arrays may have changed.
+    // Copies. A frame that is drawn again uses these, because the arrays may have
+    // changed.
     copies,
 };
 
@@ -76,23 +78,23 @@ struct BatchViews {
     uint32_t first_camera;  // first camera of these views
     uint32_t num_cameras;
     CameraSource source;
-    // Copies of the cameras of these views, to be written or read.
+    // Copies of the cameras of these views, which are written or read.
     BatchCamera* cameras;
-    uint32_t num_slots;  // result of batch_slots()
+    uint32_t num_slots;  // returned by batch_slots()
     size_t most_parts;   // largest number of parts of the tables that one camera sees
-    // Image of the first camera; the images of the other cameras follow.
+    // Image of the first camera. The images of the other cameras follow it.
     FrameImage first;
     BatchPlanes planes;   // planes of all images
-    ImageCounts* counts;  // counts of all images; the cut clears them
+    ImageCounts* counts;  // counts of all images, which the cut clears
 
     size_t num_places() const { return size_t(num_cameras) * num_slots; }
 };
 
-// Returns the number of slots of each camera of a batch, if a camera sees at most
+// Returns the number of slots per camera in a batch. A camera sees at most
 // `most_instances` instances.
 size_t batch_slots(size_t most_instances);
 
-// Memory for the placements of a batch, one element per place.
+// Memory for the placements of a batch, with one element per place.
 struct BatchPlacements {
     FrameImage* images;  // one per camera
     Placement* placements;
@@ -101,14 +103,15 @@ struct BatchPlacements {
 
 // Computes cuts of scenes on the device that is current at construction. It owns the
 // scratch memory of a cut, so only one cut can run at a time. Cuts of one scene are
-// ordered by the lock of that scene, on any threads and streams; the caller must order
-// cuts of different scenes. Scenes and streams must belong to the same device.
+// ordered by the lock of that scene, whatever their threads and streams. The caller
+// must order cuts of different scenes. Scenes and streams must belong to the same
+// device.
 //
-// Only select() waits. Memory is allocated only for a scene that is larger than all
+// Only select() waits. Memory is only allocated for a scene that is larger than all
 // earlier ones. A graph that captured a cut is valid until a larger scene is cut.
 class Cut {
   public:
-    // Writes the selected clusters as items of a frame, once per eye, and the
+    // Writes the selected clusters as items of a frame, once per eye. Also writes the
     // `pictures` to `images`. With n instances, instance i becomes placement i of model
     // bundle[i] in the first image, and placement n + i in the image of a second eye.
     // The counters and zeros of `items` must be zero.
@@ -120,22 +123,22 @@ class Cut {
     // Returns the number of elements that cut_items() needs in items.zeros.
     static size_t num_zeros(const SceneTables& scene, const SelectRule& rule);
 
-    // Writes the clusters that each camera of a batch draws as items of a frame.
-    // Decisions are equal to the decisions of cut_items(). The rule has no budget.
+    // Writes the clusters that each camera of a batch draws, as items of a frame. The
+    // decisions equal those of cut_items(). The rule must not have a budget.
     void cut_batch(const SceneTables& scene, const BatchViews& views, const SelectRule& rule,
                    const BatchPlacements& out, const ItemList& items, cudaStream_t stream);
 
     // Returns the number of elements that cut_batch() needs in items.zeros.
     static size_t num_batch_zeros(size_t num_places);
 
-    // Writes a cut that was selected earlier, and is in device memory, as items for one
-    // camera.
+    // Writes a cut that was selected earlier as items for one camera. The cut must be
+    // in device memory.
     void given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                      const FrameImage& image, FrameImage* images, Placement* placements,
                      const ItemList& items, cudaStream_t stream);
 
     // Selects clusters, waits, and returns them as pairs in host memory. `last_bin` is
-    // as in SelectInput; if it is null, the state is kept on the device.
+    // as in SelectInput. If it is null, the state is kept on the device.
     void select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                 SelectOutput& out, cudaStream_t stream, const PartlyResident* resident = nullptr,
                 uint32_t* last_bin = nullptr);

@@ -5,17 +5,18 @@
 // The formulas are compiled without floating-point contraction, so that the CPU and
 // CUDA compute the same bits.
 //
-// A group g replaces finer clusters by coarser clusters, which it makes. g is the
-// parent group of the finer clusters, and the own group of the coarser clusters. So
-// each cluster c has a group below it, own(c), unless c is a leaf; and a group above
-// it, parent(c), unless c is a top cluster. On a path from a leaf to its root, the
+// A group g replaces finer clusters by coarser clusters, which it makes. g is called
+// the parent group of the finer clusters, and the own group of the coarser clusters. A
+// cluster c that is not a leaf has a group below it, own(c). A cluster c that is not a
+// top cluster has a group above it, parent(c). On a path from a leaf to its root, the
 // parent group of each cluster is the own group of the next cluster.
 //
-// refinement(g) is how far g is refined: 0 if g fits the tolerance, so that its coarser
-// clusters suffice; kWhole if they do not. The cut gives each cluster c the weight
+// refinement(g) is how far g is refined. It is 0 if g fits the tolerance, so that its
+// coarser clusters suffice, and kWhole if they do not suffice. The cut gives each
+// cluster c the weight
 //   weight(c) = refinement(parent(c)) - refinement(own(c)).
-// Without a group below (a leaf), the second term is 0. Without a group above (a top
-// cluster), the first term is kWhole.
+// If there is no group below (a leaf), the second term is 0. If there is no group above
+// (a top cluster), the first term is kWhole.
 //
 // 1. On each path from a leaf to its root, the weights add up to kWhole, because the
 //    sum telescopes. Weights are integers, so there is no rounding.

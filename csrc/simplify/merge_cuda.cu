@@ -1,6 +1,6 @@
-// Merging on CUDA. A block merges one group, in several rounds. Nodes are in device
-// memory; the hundreds of nodes of a group stay in the caches. In the search for
-// partners, nodes are loaded into shared memory in tiles.
+// Merging on CUDA. A block merges one group, in several rounds. The nodes of a group
+// are in device memory; there are only some hundreds of them, so they stay in the
+// caches. To search for partners, they are loaded into shared memory in tiles.
 
 #include <algorithm>
 #include <cfloat>
@@ -15,10 +15,10 @@ namespace cuda {
 namespace {
 
 constexpr int kBlockSize = 256, kWarps = kBlockSize / 32;
-constexpr int kTileSize = 128;  // nodes in shared memory
+constexpr int kTileSize = 128;  // number of nodes in shared memory
 constexpr int64_t kMostRows = int64_t(1)
-                              // The largest number of rows that are merged together;
-                              // 350 MiB of scratch memory.
+                              // Maximum number of rows that are merged together. They
+                              // need 350 MiB of scratch memory.
                               << 21;
 
 // The scratch memory of a group, with one element per row.
@@ -27,7 +27,7 @@ struct Scratch {
     double* row_weight;
     MergePair *pairs, *sorted;
     int *alive, *next,
-        // A node has the number of its first row; its other rows follow in a linked
+        // A node stores the index of its first row. Its other rows follow in a linked
         // list.
         *last;
     uint8_t* is_used;
@@ -44,7 +44,7 @@ struct Scratch {
     }
 };
 
-// Makes each row a node. Returns inverse_spacing2_of() for the group.
+// Turns each row into a node. Returns inverse_spacing2_of() for the group.
 __device__ double start_nodes(const GaussianRows<const float>& in, int64_t first, int count,
                               int64_t wanted, const Scratch& group) {
     double low[3] = {DBL_MAX, DBL_MAX, DBL_MAX}, minus_high[3] = {DBL_MAX, DBL_MAX, DBL_MAX};
@@ -109,7 +109,7 @@ __device__ void find_partners(const Scratch& group, int n, double inverse_spacin
     }
 }
 
-// Sorts the pairs. The position of a pair is the number of pairs that precede it.
+// Sorts the pairs. The position of a pair is the number of pairs that come before it.
 __device__ void sort_pairs(const Scratch& group, int n) {
     __shared__ MergePair tile[kBlockSize];
     for (int base = 0; base < n; base += kBlockSize) {
@@ -136,7 +136,7 @@ __device__ void sort_pairs(const Scratch& group, int n) {
 
 // Chooses at most `allowed` of the sorted pairs. A pair is chosen if it shares no node
 // with an earlier chosen pair. Moves the chosen pairs to the front of `pairs`, and
-// returns their number. One warp calls it.
+// returns their number. Must be called by one warp.
 __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int chosen = 0;
@@ -178,7 +178,7 @@ __device__ void join_pairs(const Scratch& group, int num_pairs) {
     }
 }
 
-// Removes the nodes that disappeared from the list. One warp calls it.
+// Removes the nodes that have disappeared from the list. Must be called by one warp.
 __device__ void drop_joined(const Scratch& group, int n) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int num_kept = 0;
@@ -224,8 +224,8 @@ __global__ void __launch_bounds__(kBlockSize)
     const Scratch group = scratch.at(first - in_offset[first_group]);
     const double inverse_spacing2 = start_nodes(in, first, n, wanted, group);
     __shared__ int num_pairs;
-    // In each round, every node finds its cheapest partner; then the cheapest disjoint
-    // pairs join.
+    // In each round, every node finds its cheapest partner. Then the cheapest disjoint
+    // pairs are joined.
     while (n > wanted) {
         __syncthreads();
         find_partners(group, n, inverse_spacing2);

@@ -1,6 +1,6 @@
 // Pruning on CUDA. A block finds the median of a group along one axis. Then blocks rank
-// the gaussians of a group within their octants. In the end, the rows that are kept are
-// compacted in ascending order.
+// the gaussians of a group within their octants. Finally, the rows that are kept are
+// moved together, in ascending order.
 
 #include <cub/device/device_select.cuh>
 
@@ -19,9 +19,9 @@ namespace {
 constexpr unsigned kBlockSize = 128;
 constexpr unsigned kMostBlocksOfGroup = 64;
 
-// Finds the median of a group along one axis, bit by bit from the highest bit on. At
-// each bit, it counts the values that agree with the median's known bits and have a 0
-// next.
+// Finds the median of a group along one axis, bit by bit, beginning with the highest
+// bit. For each bit, it counts the values that agree with the median's known bits and
+// have a 0 next.
 __global__ void median_kernel(const float* means, const int64_t* in_offset, float* medians) {
     const int64_t first = in_offset[blockIdx.x];
     const int64_t last = in_offset[blockIdx.x + 1];

@@ -1,4 +1,4 @@
-// Pruning and merging on the CPU. A thread processes one group at a time.
+// Pruning and merging on the CPU. Each thread processes one group at a time.
 
 #include "simplify/simplify.h"
 
@@ -71,11 +71,11 @@ void cpu::prune(const GaussianRows<const float>& in, Span<const int64_t> in_offs
 
 namespace {
 
-// Merges `count` rows, from `first` on, to `wanted` rows. The result is written from
-// row `to` on.
+// Merges `count` rows, beginning with row `first`, to `wanted` rows. Writes the result
+// to the rows from `to` on.
 void merge_segment(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
                    const GaussianRows<float>& out, int64_t to) {
-    // A node has the number of its first row; its other rows follow in a linked list.
+    // A node stores the index of its first row. Its other rows follow in a linked list.
     std::vector<MergeNode> nodes(count);
     std::vector<double> row_weight(count);
     std::vector<int> alive(count), next(count, -1), last(count);
@@ -92,8 +92,8 @@ void merge_segment(const GaussianRows<const float>& in, int64_t first, int count
     }
     const double inverse_spacing2 = inverse_spacing2_of(low, high, wanted);
 
-    // In each round, every node finds its cheapest partner; then the cheapest disjoint
-    // pairs join.
+    // In each round, every node finds its cheapest partner. Then the cheapest disjoint
+    // pairs are joined.
     std::vector<MergeFeature> features(count);
     std::vector<MergePair> pairs;
     std::vector<char> is_used;

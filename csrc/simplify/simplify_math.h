@@ -1,8 +1,8 @@
 #pragma once
 
 // Formulas of pruning and merging, for the CPU and CUDA. They are compiled without
-// floating-point contraction, and use only functions whose results are exactly rounded.
-// So the CPU and CUDA compute the same bits.
+// floating-point contraction, and only use functions whose results are exactly rounded.
+// Therefore the CPU and CUDA compute the same bits.
 
 #include <cmath>
 #include <cstdint>
@@ -14,8 +14,8 @@
 
 namespace v3dg {
 
-// Returns the importance of a gaussian for pruning: the cube of opacity * (s1 s2
-// s3)^(2/3) (V3DG, section 3.2: product of scale and opacity). The cube has the same
+// Returns the importance of a gaussian for pruning, as the cube of opacity * (s1 s2
+// s3)^(2/3) (V3DG, section 3.2: product of scale and opacity). The cube gives the same
 // order, but needs no roots, whose last bits differ between libraries. Squared volumes
 // of float32 scales do not overflow float64. A gaussian whose volume underflows is too
 // small to be visible.
@@ -25,19 +25,20 @@ V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     return o * o * o * (volume * volume);
 }
 
-// Pruning keeps the same share of each octant of a group, so that no part of the group
-// becomes empty. The octants meet at the median of each axis, as in the published code
-// of V3DG. Repeated halving of the longest axis was visibly worse for elongated groups.
+// Pruning keeps the same fraction of each octant of a group, so that no part of the
+// group becomes empty. The octants meet at the median of each axis, as in the published
+// code of V3DG. Octants work visibly better for elongated groups than repeated halving
+// of the longest axis.
 constexpr int kOctants = 8;
 
-// Returns the octant of a position around the medians of its group. A coordinate equal
-// to the median is in the upper half.
+// Returns the octant of a position around the medians of its group. A coordinate that
+// equals the median is in the upper half.
 V3DG_HD inline int octant_of(const float mean[3], const float median[3]) {
     return 4 * (mean[0] >= median[0]) + 2 * (mean[1] >= median[1]) + (mean[2] >= median[2]);
 }
 
-// Returns the rank of the median of `count` values. If two values are in the middle,
-// the lower rank is returned.
+// Returns the rank of the median of `count` values. If there are two middle values, it
+// is the rank of the lower one.
 V3DG_HD inline int64_t median_rank(int64_t count) { return (count - 1) / 2; }
 
 // Returns how many gaussians of an octant are kept, if a group of `count` keeps
@@ -51,8 +52,8 @@ V3DG_HD inline int64_t octant_share(int64_t num_before, int64_t num_here, int64_
 // Returns the surface area of an ellipsoid divided by 4 pi, with an error of at most
 // 1.2 %. The area of the ellipsoid's shadow, sqrt(b²c² x² + a²c² y² + a²b² z²), is
 // averaged over the directions along the axes and along their diagonals. The weights
-// minimise the largest error over all shapes. Square roots are exactly rounded in every
-// library.
+// minimise the largest error over all shapes. Only square roots are used, because every
+// library rounds them exactly.
 V3DG_HD inline double ellipsoid_area(double a, double b, double c) {
     constexpr double kAlongOne = 0.0604247, kBetweenTwo = 0.1013528, kBetweenThree = 0.5029995;
     const double bc = b * c, ac = a * c, ab = a * b;
@@ -119,8 +120,8 @@ V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], doub
 
 // Computes the quaternion of a rotation matrix.
 V3DG_HD inline void quat_of_axes(const double e[3][3], double quat[4]) {
-    // Begin with the component of largest magnitude, so that no small number is a
-    // divisor.
+    // Begin with the component of largest magnitude, so that the code never divides by
+    // a small number.
     const double four[4] = {1 + e[0][0] + e[1][1] + e[2][2], 1 + e[0][0] - e[1][1] - e[2][2],
                             1 - e[0][0] + e[1][1] - e[2][2], 1 - e[0][0] - e[1][1] + e[2][2]};
     int largest = 0;
@@ -163,9 +164,9 @@ V3DG_HD inline MergeNode merge_node_of(const GaussianRows<const float>& in, int6
     return node;
 }
 
-// Returns the cost of joining a pair: the increase of the variance of positions
-// (relative to the spacing of the remaining gaussians) and of colours. This is Ward's
-// criterion, weighted by area * opacity.
+// Returns the cost of joining a pair. It is the increase of the variance of colours and
+// of positions, the latter relative to the spacing of the remaining gaussians. This is
+// Ward's criterion, weighted by area * opacity.
 V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
                                  double inverse_spacing2) {
     constexpr double kColorWeight = 6;
@@ -197,8 +198,8 @@ V3DG_HD inline bool is_before(const MergePair& x, const MergePair& y) {
     return x.cost != y.cost ? x.cost < y.cost : (x.a != y.a ? x.a < y.a : x.b < y.b);
 }
 
-// Returns how many pairs of `count` gaussians one round joins: half of the joins that
-// remain, so that costs are updated in between.
+// Returns how many pairs one round joins, if there are `count` gaussians. It is half of
+// the joins that remain, so that costs are updated in between.
 V3DG_HD inline int64_t pairs_in_round(int64_t count, int64_t wanted) {
     return (count - wanted + 1) / 2;
 }

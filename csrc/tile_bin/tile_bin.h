@@ -1,7 +1,7 @@
 #pragma once
 
-// Binning: makes the lists of records from which the tiles of a picture are blended. On
-// the CPU, sort_tile() then sorts a list; on CUDA, the blend stage sorts it.
+// Binning: makes the lists of records that the tiles of a picture blend. On the CPU,
+// sort_tile() sorts a list afterwards. On CUDA, the blend stage sorts it.
 
 #include <atomic>
 #include <cstddef>
@@ -32,23 +32,23 @@ struct TileGrid {
     int row(size_t tile) const { return first_row + static_cast<int>(tile / columns); }
 };
 
-// The lists of all tiles. Tile t has entries offset[t] to offset[t + 1], ordered by
-// chunk.
+// The lists of all tiles. Tile t has the entries from offset[t] to offset[t + 1],
+// ordered by chunk.
 struct TileLists {
     EntryFormat format;
     Buffer<uint64_t> offset;
     Buffer<uint64_t> entry;
     uint64_t num_entries = 0;
-    // The list of one chunk: entries of records [first, first + count), ordered by
+    // The list of one chunk: the entries of records [first, first + count), ordered by
     // tile.
     struct Chunk {
         uint64_t first, count;
         uint32_t least_depth, most_depth;  // range of the bits of the records' depths
-        // The entries of the chunk: the index of the record in the chunk, and all depth
-        // bits.
+        // The entries of the chunk. Each has the index of the record in the chunk, and
+        // all bits of the depth.
         Buffer<uint64_t> entry;
     };
-    // For each chunk, the first entry of each tile in the chunk, and the end:
+    // For each chunk, the first entry of each tile in the chunk, then the end:
     // [num_chunks][num_tiles + 1].
     Buffer<uint32_t> chunk_offset;
     std::vector<Chunk> chunk;
@@ -59,10 +59,11 @@ struct TileLists {
     }
 };
 
-// The largest number of records in a chunk.
+// Maximum number of records in a chunk.
 constexpr uint64_t kMostChunkRecords = uint64_t(1) << 21;
 
-// The format of a chunk's entries: all bits of a depth, and the index in the chunk.
+// The format of a chunk's entries: all bits of a depth, and the index of the record in
+// the chunk.
 constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0, INT32_MAX);
 
 // The lists of all tiles of a picture that one thread draws, in kChunkFormat.
@@ -91,7 +92,7 @@ struct GrowingLists {
     }
 };
 
-// Bins the records of one chunk: records[first] to records[first + count]. It is
+// Bins the records of one chunk, records[first] to records[first + count]. This is
 // fastest while the records are in the cache. Chunks may be binned concurrently.
 template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
@@ -103,8 +104,8 @@ template <class T>
 void append_records(const Record<T>* records, uint32_t first, uint32_t count, const TileGrid& grid,
                     GrowingLists& out);
 
-// Joins the lists of all chunks into one list per tile. If `stop` becomes true, it
-// returns soon, and the lists are incomplete.
+// Joins the lists of all chunks to one list per tile. If `stop` becomes true, returns
+// soon, with incomplete lists.
 void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
                  const std::atomic<bool>* stop = nullptr);
 
@@ -119,7 +120,7 @@ namespace cuda {
 // The input of tile_bin(), in device memory.
 struct TileBinInput {
     const ItemTiles* items;
-    // The tiles of each record; kManyTiles for records that are in `large`.
+    // The tiles of each record, or kManyTiles for records that are in `large`.
     const FewTiles* few;
     RecordPlanes records;
     const FrameImage* images;
@@ -127,12 +128,13 @@ struct TileBinInput {
     Capacity capacity;
     const LargeRecord* large;
     TileCounts counts;
-    // The function sets counters->entries. Large records beyond the capacity are not
-    // counted in it.
+    // This function sets counters->entries. That count does not include large records
+    // beyond the capacity.
     FrameCounters* counters;
 };
 
-// The output of tile_bin(): tile t has entries tile_first[t] to tile_first[t + 1].
+// The output of tile_bin(). Tile t has the entries from tile_first[t] to tile_first[t +
+// 1].
 struct TileBinOutput {
     unsigned long long* tile_first;  // [num_tiles + 1]
     uint32_t* image_of_tile;         // [num_tiles] index of the image of each tile

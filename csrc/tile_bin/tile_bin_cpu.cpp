@@ -1,6 +1,6 @@
-// Binning on the CPU. The entries of each chunk are counted, scanned and scattered;
-// most chunks reach few tiles. Then each tile collects its entries chunk by chunk, so
-// that the order of entries does not depend on which thread processes which chunk.
+// Binning on the CPU. For each chunk, entries are counted, scanned and scattered; most
+// chunks only reach a few tiles. Then each tile collects its entries chunk by chunk, so
+// that their order does not depend on which thread processes which chunk.
 
 #include "tile_bin/tile_bin.h"
 
@@ -39,8 +39,8 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
                size_t chunk, TileLists& out) {
     const size_t num_tiles = grid.size();
     // offset[t + 1] is first the number of entries of tile t, then the index of its
-    // first entry, then the index of its next free entry. In the end, it is thus the
-    // first entry of tile t + 1.
+    // first entry, then the index of its next free entry. At the end, it is therefore
+    // the first entry of tile t + 1.
     uint32_t* offset = out.chunk_offset.data() + chunk * (num_tiles + 1);
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
     const Record<T>* record = records + first;
@@ -115,7 +115,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
     out.num_entries = offset[num_tiles];
     const EntryFormat format = out.format = format_of(out.chunk.data(), num_chunks);
     uint64_t* entry = out.entry.reserve(out.num_entries);
-    // The offsets of 16 tiles in a chunk fill a cache line.
+    // The offsets of 16 tiles of a chunk fill one cache line.
     constexpr size_t kTogether = 16;
     parallel_for((num_tiles + kTogether - 1) / kTogether, 1, [&](size_t group) {
         const size_t first = group * kTogether, last = std::min(first + kTogether, num_tiles);
@@ -143,8 +143,8 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
 
 constexpr int kMostDigitBits = 12;
 
-// Returns the bits of a digit for sorting `count` entries. Few entries need few
-// counters.
+// Returns the number of bits of a digit for sorting `count` entries. Fewer entries need
+// fewer counters.
 static int digit_bits_of(size_t count) {
     if (count < 1024) return 8;
     if (count < 8192) return 10;
@@ -193,8 +193,9 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
     least = least >> depth_shift << depth_shift;
     const int bits = static_cast<int>(std::bit_width((most - least) >> depth_shift));
     if (bits == 0) return;
-    // A radix sort of two digits, which contain only bits that differ after the
-    // smallest depth is subtracted. If bits are left, few neighbours are out of order.
+    // A radix sort with two digits. They contain only bits that still differ after the
+    // smallest depth is subtracted. If more bits differ, only a few neighbours are out
+    // of order afterwards.
     const int sorted_bits = std::min(bits, 2 * digit_bits_of(count));
     const int key_shift = depth_shift + bits - sorted_bits;
     const int low_bits = sorted_bits / 2;
@@ -249,7 +250,7 @@ void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t
     }
 }
 
-// Compares the records, because an entry cannot hold all bits of a double.
+// Compare the records, because an entry cannot hold all bits of a double.
 template <>
 void sort_tile<double>(const Record<double>* records, EntryFormat format, uint64_t* entry,
                        size_t count, uint64_t*) {

@@ -1,8 +1,8 @@
-// Binning on CUDA: counts the records per tile, scans the counts, and scatters entries.
-// project() has counted the records over few tiles already. Records over many tiles
-// (large records) are counted here, and a warp shares their rows of tiles. The file is
-// compiled without floating-point contraction, so that counting and scattering compute
-// the same ellipses.
+// Binning on CUDA. It counts the records per tile, scans the counts, and scatters
+// entries. project() has already counted the records that touch few tiles. Records that
+// touch many tiles (large records) are counted here, and a warp shares their rows of
+// tiles. The file is compiled without floating-point contraction, so that counting and
+// scattering compute the same ellipses.
 
 #include "tile_bin/tile_bin.h"
 
@@ -19,7 +19,7 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-// Resident blocks per multiprocessor with 164 KiB of shared memory.
+// Number of resident blocks per multiprocessor with 164 KiB of shared memory.
 constexpr unsigned kBlocks = 5;
 
 // The block size, and the blocks per multiprocessor, of count_large_kernel.
@@ -27,8 +27,8 @@ constexpr unsigned kCountThreads = 512, kCountBlocks = 3;
 // Blocks count in shared memory if there are at least this many large records per tile.
 constexpr unsigned kLeastLarge = 16;
 
-// The large records that a warp processes together. Lane i and lane i + 16 have the
-// same record.
+// The large records that a warp processes together. Lanes i and i + 16 have the same
+// record.
 struct LargeBatch {
     uint32_t image;
     uint32_t record;  // index of this lane's record
@@ -60,8 +60,8 @@ __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
             static_cast<uint16_t>(rows), static_cast<uint16_t>(rows >> 16)};
 }
 
-// Returns the first of the lanes 0 to kCount - 1 whose `number` is above `at`, or the
-// last of these lanes if there is none. Numbers must not decrease from lane to lane.
+// Among the lanes 0 to kCount - 1, returns the first whose `number` is above `at`, or
+// the last one if there is none. Numbers must not decrease from lane to lane.
 template <int kCount>
 __device__ int first_lane_above(int number, int at) {
     int lane = 0;
@@ -71,10 +71,11 @@ __device__ int first_lane_above(int number, int at) {
     return lane;
 }
 
-// Visits the tiles that a batch's records may reach, 32 tile rows at a time. First it
+// Visits the tiles that a batch's records may reach, 32 tile rows at a time. First, it
 // calls begin_row(number, record) in each lane, with the record of that lane's row.
-// Then it calls visit(from, row, column) for 32 tiles at a time, one per lane; `from`
-// is the lane whose row contains the tile. A negative column means no tile.
+// Then it calls visit(from, row, column) for 32 tiles at a time, one per lane. `from`
+// is the lane whose row contains the tile. A negative column means that there is no
+// tile.
 template <class BeginRow, class Visit>
 __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
                               const LargePart& part, const BeginRow& begin_row,
@@ -103,8 +104,8 @@ __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
     }
 }
 
-// Calls visit(batch, part) for all batches of large records. All warps of the grid take
-// part. If there are few batches, several warps process parts of the same batch.
+// Calls visit(batch, part) for all batches of large records. All warps of the grid must
+// call it. If there are few batches, several warps process parts of the same batch.
 template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
@@ -112,7 +113,7 @@ __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     const unsigned num_batches = static_cast<unsigned>(in.counters->large / kLargeAtOnce);
     const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
     const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
-    // Adjacent batches cost about the same, so they are distributed over the blocks.
+    // Adjacent batches cost about the same, so each goes to a different block.
     for (unsigned at = blockIdx.x + threadIdx.x / 32 * gridDim.x; at < num_batches << log2_parts;
          at += num_warps)
         visit(load_batch(in, static_cast<unsigned long long>(at >> log2_parts) * kLargeAtOnce),
@@ -134,7 +135,8 @@ __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) 
 }
 
 // Adds large records to the counts of their tiles. If there are many large records, and
-// shared memory has room for a counter per tile, a block counts there first.
+// shared memory has room for a counter per tile, each block first counts in shared
+// memory.
 __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
     count_large_kernel(TileBinInput in, bool has_room) {
     await_kernel_before();
@@ -170,7 +172,8 @@ __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
     return first;
 }
 
-// Computes the first entry of each tile from the counts. One thread per tile.
+// Computes the first entry of each tile from the counts. Launched with one thread per
+// tile.
 __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();
     __shared__ unsigned long long before_block;
@@ -196,7 +199,7 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
 // The destination of entries. A tile's list is filled from its end to its beginning.
 struct Scatter {
     const unsigned long long* tile_first;
-    // [num_tiles] number of free entries, initially the count of the tile
+    // [num_tiles] number of free entries; initially the tile's count
     uint32_t* left;
     TileEntry* entries;
 };
@@ -208,7 +211,7 @@ struct Places {
     // Number of free entries in the tile's list before this warp adds its entries.
     uint32_t left;
 
-    // A lane with kNoTile gets no position. All lanes of the warp must call it.
+    // All lanes of the warp must call it. A lane with kNoTile gets no position.
     __device__ Places(const Scatter& to, uint32_t tile)
         : peers(__match_any_sync(kAllLanes, tile)), left(0) {
         if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
@@ -222,19 +225,19 @@ struct Places {
     }
 };
 
-// The number of entries that a warp scatters at once: two per lane, to hide the latency
-// of the atomic operation.
+// Number of entries that a warp scatters at once: two per lane, to hide the latency of
+// the atomic operation.
 constexpr unsigned kAtOnce = 2, kFewAtOnce = 32 * kAtOnce;
 
-// A record over few tiles, and the number of one of these tiles.
+// A record that touches few tiles, and the number of one of these tiles.
 struct FewPlace {
     FewTiles few;  // kManyTiles if there is no record
     uint32_t record;
     unsigned tile;
 };
 
-// A queue of records and tile numbers. It receives the tiles of a record beyond the
-// first; the warp scatters entries when there are kFewAtOnce.
+// A queue of records and tile numbers. It receives all tiles of a record except the
+// first one. The warp scatters the queued entries when there are kFewAtOnce of them.
 struct WaitingPlaces {
     static constexpr unsigned kMost = kFewAtOnce - 1 + kFewAtOnce * (kFewTiles - 1);
     FewTiles few[kMost];
@@ -346,8 +349,8 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         });
 }
 
-// Scatters all records, large records last. A warp claims its next item when it starts
-// the current one, to hide the latency of the atomic operation.
+// Scatters all records, with large records last. A warp claims its next item when it
+// starts the current one, which hides the latency of the atomic operation.
 __global__ void __launch_bounds__(kThreads, kBlocks)
     scatter_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();

@@ -1,6 +1,6 @@
 """Compile the core to WebAssembly: `python csrc/wasm/build.py OUT.wasm`.
 
-The compiler is zig, which pip installs (`pip install ziglang`).
+The compiler is zig (`pip install ziglang`).
 """
 
 import subprocess
@@ -20,13 +20,14 @@ SOURCES = (
     "residency/cluster_table.cpp",
     "select/select_cpu.cpp",
 )
-# Other systems compile this for several instruction sets. WebAssembly has one.
+# Other systems compile these for several instruction sets, but WebAssembly has only
+# one.
 LANE_SOURCES = ("io/blake2b_lanes.cpp",)
 TARGET = ("-target", "wasm32-wasi", "-msimd128", "-O2")
 FLAGS = (
     "-std=c++20",
     "-fvisibility=hidden",
-    # Decisions have the bits of every other system.
+    # Without contraction, decisions have the same bits as on every other system.
     "-ffp-contract=off",
     "-fno-math-errno",
     "-fno-trapping-math",

@@ -1,11 +1,11 @@
-// The core as a module of WebAssembly, for web pages: selection with budgets and fades,
-// decoding of pages, and hashes. It has no threads and reads no files: the page parses
-// the header of a bundle, fetches bytes, and hands over the tables.
+// The core as a WebAssembly module for web pages: selection with budgets and fades,
+// decoding of pages, and hashes. It has no threads and reads no files. The JavaScript
+// code parses the header of a bundle, fetches bytes, and passes the tables.
 //
-// All pointers are addresses in the module's memory, from v3dg_allocate(). Tables are
-// borrowed, so they must stay there as long as the bundle. The caller checks sizes and
-// indices: functions of this module trust them. core.js in
-// v3dg/export/web is the interface for JavaScript.
+// All pointers are addresses in the module's memory, allocated with v3dg_allocate().
+// The module keeps pointers to tables, so tables must stay in memory as long as the
+// bundle. The caller must check sizes and indices, because the functions of this module
+// do not. core.js in v3dg/export/web is the interface for JavaScript.
 
 #include <cstdint>
 #include <memory>
@@ -19,8 +19,8 @@
 #include "residency/cluster_table.h"
 #include "select/select.h"
 
-// The C++ library for WebAssembly is built without exceptions. An error, mostly out of
-// memory, ends the call by a trap, after which the module must be loaded again.
+// For WebAssembly, the C++ library is built without exceptions. An error, which usually
+// is out of memory, ends the call with a trap; the module must then be loaded again.
 extern "C" {
 void* __cxa_allocate_exception(size_t) noexcept { __builtin_trap(); }
 [[noreturn]] void __cxa_throw(void*, void*, void (*)(void*)) { __builtin_trap(); }
@@ -32,7 +32,7 @@ using namespace v3dg;
 
 namespace {
 
-// The tables of a bundle, in the order of core.js.
+// The tables of a bundle, in the order that core.js uses.
 struct BundleArrays {
     uint32_t num_groups, num_clusters;
     const float *ball, *weight;
@@ -41,11 +41,13 @@ struct BundleArrays {
     const int64_t* offset;
     const float* filter_px2;
     const uint8_t* antialiased;
-    // [G + 1] kAbsentPage for pages that are not resident, otherwise any row; null if
-    // all are
+    // [G + 1] kAbsentPage for pages that are absent, and any row for others; null if
+    // all pages are resident
     const int64_t* shift;
-    const int32_t* begins;  // [G + 1] see PageTable::begins; null if all have faded in
-    uint32_t* needs;        // [G + 1] see SelectInput::needs; null without requests
+    const int32_t* begins;  // [G + 1] as in PageTable::begins; null if all pages have
+                            // faded in
+    uint32_t* needs;        // [G + 1] as in SelectInput::needs; null if needs are not
+                            // requested
 };
 
 struct WebBundle {
@@ -73,7 +75,7 @@ struct WebBundle {
     Span<uint32_t> needs;
 };
 
-// The tables of a file, in the order of core.js. They may have any contents.
+// The tables of a file, in the order that core.js uses. They may have any contents.
 struct FileArrays {
     uint32_t num_groups, num_clusters;
     const int64_t* offset;
@@ -85,21 +87,21 @@ struct FileArrays {
     const float* error;
 };
 
-// The instances of a scene, in the order of core.js.
+// The instances of a scene, in the order that core.js uses.
 struct InstanceArrays {
     uint32_t count;
     const int32_t* bundle;
     const double *position, *quaternion, *scale;
     const float* importance;
-    const float* factors;  // [I * 4] null if all are 1
+    const float* factors;  // [I * 4] null if all factors are 1
 };
 
-// A pinhole camera and the rule of a cut, in the order of core.js.
+// A pinhole camera and the rule of a cut, in the order that core.js uses.
 struct ViewValues {
     double viewmat[16], k[9];
     double near_depth;
     double tolerance_px2;
-    double budget;  // negative: none
+    double budget;  // negative if there is no budget
     double fade;
     int32_t width, height, min_level, culls, is_paper, in_steps, frames_at_rest, frame;
 };
@@ -149,7 +151,7 @@ struct WebScene {
     }
 };
 
-// The result of a selection, in the order of core.js.
+// The result of a selection, in the order that core.js uses.
 struct CutValues {
     double num_gaussians;
     float tolerance_px2;
@@ -160,12 +162,12 @@ struct CutValues {
 
 }  // namespace
 
-// Returns memory that is aligned to 64 bytes, or null.
+// Allocates memory that is aligned to 64 bytes. Returns null if there is too little.
 V3DG_EXPORT(v3dg_allocate) void* v3dg_allocate(uint32_t bytes) { return allocate_pages(bytes); }
 V3DG_EXPORT(v3dg_free) void v3dg_free(void* memory) { free_pages(memory); }
 
-// Returns if the tables are valid; otherwise ends by a trap. The number of gaussians is
-// taken from the tables.
+// Returns if the tables are valid, and otherwise ends with a trap. The number of
+// gaussians is taken from the tables.
 V3DG_EXPORT(v3dg_check_tables) void v3dg_check_tables(const FileArrays* in) {
     const size_t groups = in->num_groups, clusters = in->num_clusters;
     check_tables({.offset = {in->offset, clusters + 1},
@@ -196,8 +198,8 @@ WebScene* v3dg_make_scene(const WebBundle* const* bundles, uint32_t count) {
 }
 V3DG_EXPORT(v3dg_free_scene) void v3dg_free_scene(WebScene* scene) { delete scene; }
 
-// Sets the instances of a scene. The arrays are borrowed; their values may change until
-// the next call.
+// Sets the instances of a scene. The module keeps pointers to the arrays. Their values
+// may be changed until the next call.
 V3DG_EXPORT(v3dg_set_instances)
 void v3dg_set_instances(WebScene* scene, const InstanceArrays* in) {
     const size_t count = in->count;
@@ -210,8 +212,8 @@ void v3dg_set_instances(WebScene* scene, const InstanceArrays* in) {
         scene->instances.factors = {reinterpret_cast<const InstanceFactors*>(in->factors), count};
 }
 
-// Selects the cut of a view. `out` refers to memory of the scene, which is valid until
-// its next selection.
+// Selects the cut of a view. `out` receives pointers to memory of the scene, which is
+// valid until the scene's next selection.
 V3DG_EXPORT(v3dg_select)
 void v3dg_select(WebScene* scene, const ViewValues* view, CutValues* out) {
     scene->select(*view);
@@ -225,8 +227,8 @@ void v3dg_select(WebScene* scene, const ViewValues* view, CutValues* out) {
             .weight = cut.weight.empty() ? nullptr : cut.weight.data()};
 }
 
-// Returns the number of clusters of a coded page, or the index of the first cluster
-// whose ranges are invalid. `offset` is as for v3dg_decode_page().
+// Returns the number of clusters of a coded page. If ranges are invalid, returns the
+// index of the first such cluster instead. `offset` is as for v3dg_decode_page().
 V3DG_EXPORT(v3dg_check_page)
 uint32_t v3dg_check_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
                          int32_t sh_degree) {
@@ -241,9 +243,9 @@ uint32_t v3dg_check_page(const int64_t* offset, uint32_t num_clusters, const uin
     return num_clusters;
 }
 
-// Decodes the gaussians of a coded page. `offset` has the first row of each cluster and
-// the end. Returns the number of clusters, or the index of the first cluster whose
-// ranges are invalid; then nothing is decoded.
+// Decodes the gaussians of a coded page, and returns the number of its clusters.
+// `offset` has the first row of each cluster, then the end. If ranges are invalid,
+// decodes nothing, and returns the index of the first such cluster.
 V3DG_EXPORT(v3dg_decode_page)
 uint32_t v3dg_decode_page(const int64_t* offset, uint32_t num_clusters, const uint32_t* words,
                           int32_t sh_degree, float* means, float* quats, float* scales,

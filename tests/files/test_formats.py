@@ -1250,7 +1250,7 @@ def test_a_checkpoint_executes_nothing(tmp_path, monkeypatch):
     torch.save({"splats": gsplat_tensors(random_gaussians(2, 0)), "extra": Harmful()}, "a.pt")
     assert_refused_cheaply(
         Path("a.pt"),
-        "expected a checkpoint of tensors and plain values, got one whose pickle refers to",
+        "expected a checkpoint of tensors and plain values, got one that refers to",
     )
     assert not Path("harm").exists()
 

@@ -27,7 +27,7 @@ from random_bundle import random_bundle, random_gaussians
 from scenes_lod import blob, lod_bundle
 from v3dg import _urls, cli
 from v3dg._urls.addresses import Reach, reach_of
-from v3dg._urls.failures import Problem
+from v3dg._urls.failures import DownloadError
 from v3dg._urls.http import WebSource
 
 fsspec = pytest.importorskip("fsspec")
@@ -624,7 +624,7 @@ def test_a_name_that_becomes_private_is_refused(web, names, tmp_path):
     source = WebSource(fsspec.filesystem("http"), f"http://public.test:{web.server_port}/a.v3dg")
     names["public.test"] = ["127.0.0.2"]
     web.sent.clear()
-    with pytest.raises(Problem, match="refused a redirect"):
+    with pytest.raises(DownloadError, match="refused a redirect"):
         source.read_parts([(0, 8)], lambda data, offset: None)
     assert web.sent == []
 

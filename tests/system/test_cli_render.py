@@ -183,6 +183,15 @@ def test_panorama_shows_all_directions(render):
     assert not covered[:10].any()
 
 
+def test_panoramas_have_a_size_by_default(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 200, size=0.4), 32).write("blob.v3dg")
+    command = ["render", "blob.v3dg", "--device", "cpu", "--projection", "equirectangular"]
+    assert cli.main([*command, "-o", "around.png"]) == 0
+    assert pixels("around.png").shape == (800, 1600, 3)
+
+
 def test_panorama_is_drawn_from_the_camera_of_a_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)

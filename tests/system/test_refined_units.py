@@ -21,9 +21,10 @@ from v3dg.cli import refine as command
 from v3dg.levels import build_file, discard_levels, levels_path
 from v3dg.levels.refined import RefineRequest, with_refined_levels
 from v3dg.levels.refined_units import refined_bundle
-from v3dg.levels.unfinished import units_folder
+from v3dg.levels.unfinished import locked_units, units_folder
 from v3dg.levels.viewpoints import cameras_that_see
 from v3dg.levels.whole import devices_for
+from v3dg.refine import refine_file
 
 QUICK = BuildConfig(cluster_size=32, steps=0)
 NUM_LEAVES = 1600
@@ -56,6 +57,12 @@ def asset(file):
 @pytest.fixture(scope="module")
 def draft(asset):
     return v3dg.build_bundle(asset, config=QUICK, seed=3, device="cpu", progress=False)
+
+
+def in_file(bundle, folder):
+    """The bundle, opened from the file draft.v3dg."""
+    bundle.write(folder / "draft.v3dg")
+    return v3dg.Bundle.open(folder / "draft.v3dg")
 
 
 def build(file, output, *, device="cpu", **options):
@@ -188,8 +195,7 @@ def test_the_part_above_leaves_the_levels_of_units_alone(draft):
 
 def test_workers_and_files_do_not_change_the_bytes(draft, refined, file, tmp_path):
     expected = bytes_of(refined, tmp_path)
-    draft.write(tmp_path / "draft.v3dg")
-    opened = v3dg.Bundle.open(tmp_path / "draft.v3dg")
+    opened = in_file(draft, tmp_path)
     for number, devices in enumerate(([CPU], [CPU] * 3)):
         folder = tmp_path / str(number)
         of_file = refined_bundle(opened, REQUEST, devices, progress=False, folder=folder)
@@ -237,7 +243,10 @@ def test_an_interrupted_refinement_continues_after_the_last_unit(
         return refine(*arguments, **options)
 
     monkeypatch.setattr("v3dg.levels.refined_units.with_refined_levels", counted)
-    for most_calls in (0, 1, 3, NUM_UNITS):
+    with pytest.raises(Interrupted):
+        build(file, output, resume=True)
+    assert not folder.exists()
+    for most_calls in (1, 3, NUM_UNITS):
         with pytest.raises(Interrupted):
             build(file, output, resume=True)
         assert names_in(folder) == [f"{unit}.v3dg" for unit in range(most_calls)]
@@ -254,8 +263,7 @@ def test_an_interrupted_refinement_continues_after_the_last_unit(
 
 
 def test_units_of_another_refinement_are_made_again(draft, tmp_path):
-    draft.write(tmp_path / "draft.v3dg")
-    opened = v3dg.Bundle.open(tmp_path / "draft.v3dg")
+    opened = in_file(draft, tmp_path)
     folder = tmp_path / "units"
     camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=64, height=64)[0]
     for request in (
@@ -283,8 +291,7 @@ def test_a_build_that_starts_again_removes_units(file, tmp_path):
 
 
 def test_a_damaged_unit_is_named(draft, tmp_path):
-    draft.write(tmp_path / "draft.v3dg")
-    opened = v3dg.Bundle.open(tmp_path / "draft.v3dg")
+    opened = in_file(draft, tmp_path)
     folder = tmp_path / "units"
     refined_bundle(opened, REQUEST, [CPU], progress=False, folder=folder)
     (folder / "1.v3dg").write_bytes(b"something else")
@@ -293,8 +300,7 @@ def test_a_damaged_unit_is_named(draft, tmp_path):
 
 
 def test_the_bar_counts_all_units(draft, tmp_path):
-    draft.write(tmp_path / "draft.v3dg")
-    opened = v3dg.Bundle.open(tmp_path / "draft.v3dg")
+    opened = in_file(draft, tmp_path)
     total = (NUM_UNITS + 1) * (20 + REQUEST.steps)
     folder = tmp_path / "units"
     states = []
@@ -367,7 +373,9 @@ def test_a_refinement_that_is_killed_again_and_again_gets_to_its_end(file, tmp_p
         process = subprocess.Popen(arguments, env=environment)
         while process.poll() is None:
             names = {path.name for path in folder.glob("*.v3dg")}
-            if len(names) > num_kills:
+            # The process may already write the result, which a kill would interrupt, if
+            # the levels above the units are finished.
+            if num_kills < len(names) <= NUM_UNITS:
                 process.send_signal(signal.SIGKILL)
                 assert finished < names
                 finished = names
@@ -399,3 +407,51 @@ def test_the_command_refines_in_units(draft, tmp_path, capsys):
     expected = refined_bundle(draft, REQUEST, [CPU], progress=False)
     assert output.read_bytes() == bytes_of(expected, tmp_path)
     assert names_in(tmp_path) == ["bytes.v3dg", "draft.v3dg", "refined.v3dg"]
+
+
+def refuses(work):
+    with pytest.raises(RuntimeError, match=r"\.units: another refinement is using it; wait"):
+        work()
+
+
+def test_a_second_refinement_with_the_same_output_is_refused(draft, file, tmp_path):
+    output = tmp_path / "out.v3dg"
+    draft = in_file(draft, tmp_path)
+    options = {"steps": REQUEST.steps, "device": "cpu", "progress": False}
+    with locked_units(units_folder(output)) as folder:
+        refuses(lambda: refine_file(draft, output, **options))
+        refuses(lambda: v3dg.refine_bundle(draft, folder=folder, **options))
+    assert names_in(tmp_path) == ["draft.v3dg"]
+    refine_file(draft, output, **options)
+    assert names_in(tmp_path) == ["draft.v3dg", "out.v3dg"]
+    built = tmp_path / "built.v3dg"
+    with locked_units(units_folder(levels_path(built))):
+        refuses(lambda: build(file, built))
+
+
+def test_a_lock_on_a_folder_that_was_removed_is_none(tmp_path, monkeypatch):
+    """If a refinement ends and removes the folder that another one has opened, the lock
+    of the latter would protect nothing."""
+    folder = tmp_path / "out.units"
+    locked = []
+
+    def lock(descriptor, *_):
+        if not locked:
+            folder.rmdir()
+        locked.append(os.fstat(descriptor))
+
+    monkeypatch.setattr("v3dg._files.lock", lock)
+    with locked_units(folder):
+        assert os.path.samestat(locked[-1], folder.stat())
+    assert len(locked) == 2
+    assert names_in(tmp_path) == []
+
+
+def test_a_failed_refinement_keeps_units_and_ends_the_lock(draft, tmp_path):
+    draft = in_file(draft, tmp_path)
+    (tmp_path / "out.units").mkdir()
+    (tmp_path / "out.units" / "0.v3dg").write_bytes(b"none")
+    with pytest.raises(ValueError, match=r"0\.v3dg"):
+        refine_file(draft, tmp_path / "out.v3dg", steps=6, device="cpu", progress=False)
+    with locked_units(tmp_path / "out.units"):
+        assert names_in(tmp_path / "out.units") == ["0.v3dg"]

@@ -33,7 +33,7 @@ for (let frame = 1; frame < 400; frame += 1) {
   const wanted = [0, 1].flatMap((bundle) => {
     const needs = new Float32Array(PAGES);
     for (let k = 0; k < 3; k += 1) needs[random(PAGES - 1)] = 1 + random(8);
-    return pool.note(bundle, needs, frame);
+    return pool.recordNeeds(bundle, needs, frame);
   });
   const isResident = (key) => pool.pages[key[0]].isResident(Number(key.slice(2)));
   used = new Set();

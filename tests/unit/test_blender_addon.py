@@ -166,14 +166,14 @@ def test_nothing_has_no_cuts(bundle):
 def test_a_cut_is_due_when_something_changed_and_the_last_one_is_over():
     due = pace.Pace()
     assert due.is_due("here", 0.0)
-    due.note("here", 1.0, 0.5)
+    due.record("here", 1.0, 0.5)
     assert not due.is_due("here", 10.0)
     # The pause is twice as long as the cut took.
     assert not due.is_due("there", 1.9)
     assert due.is_due("there", 2.1)
     due.forget()
     assert due.is_due("here", 2.1)
-    due.note("here", 3.0, 0.0)
+    due.record("here", 3.0, 0.0)
     assert not due.is_due("there", 3.1)
 
 

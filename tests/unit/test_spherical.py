@@ -479,6 +479,12 @@ ERRORS = {
     "environment[0]: expected -1 to -1, as the scene has, got 0": lambda: v3dg.scan(
         some_bundle(), LIDAR, np.eye(4), environment=0
     ),
+    "pose[2]: expected finite numbers, got nan": lambda: v3dg.scan(
+        dot((1, 0, 0)), LIDAR, [np.eye(4), np.eye(4), np.full((4, 4), math.nan)]
+    ),
+    "pose: expected finite numbers, got inf": lambda: v3dg.scan(
+        dot((1, 0, 0)), LIDAR, np.full((4, 4), math.inf)
+    ),
     "budget: expected none": lambda: v3dg.render(
         dot((1, 0, 0)), EquirectangularCamera(np.eye(4), 32), budget=3
     ),

@@ -14,7 +14,7 @@ _AGAIN = "try again later"
 _LONGEST = 200  # number of characters of a library's message that are shown
 
 
-class Problem(Exception):
+class DownloadError(Exception):
     """The reason why a file cannot be downloaded, and the type of the error that users
     get. The text does not contain the URL."""
 
@@ -23,7 +23,7 @@ class Problem(Exception):
         self.kind = kind
 
 
-def status_problem(status: int) -> Problem:
+def status_error(status: int) -> DownloadError:
     """Return the problem of an answer whose status code is an error."""
     try:
         # The server's own phrase is not used, as it may be any text.
@@ -31,7 +31,7 @@ def status_problem(status: int) -> Problem:
     except ValueError:
         phrase = str(status)
     kind, advice = _kind_of_status(status)
-    return Problem(kind, f"the server answered {phrase}; {advice}")
+    return DownloadError(kind, f"the server answered {phrase}; {advice}")
 
 
 def _kind_of_status(status: int) -> tuple[type[OSError], str]:
@@ -66,13 +66,13 @@ def naming_errors(url: str) -> Iterator[None]:
 
 def _failure_of(url: str, error: Exception) -> Exception:
     problem = error
-    if not isinstance(problem, Problem):
+    if not isinstance(problem, DownloadError):
         problem = _problem_of(url, error)
     name = f"{shown(url)}: "
     return problem.kind(name + str(problem).removeprefix(name))
 
 
-def _problem_of(url: str, error: Exception) -> Problem:
+def _problem_of(url: str, error: Exception) -> DownloadError:
     """Return the problem that caused an error of the system, of fsspec or of aiohttp.
     The types of aiohttp are recognised by their names, because aiohttp may not be
     installed."""
@@ -84,7 +84,7 @@ def _problem_of(url: str, error: Exception) -> Problem:
         cause = system_error
     text = _text_of(url, error)
     if isinstance(error, ValueError) and "ClientError" not in names:
-        return Problem(ValueError, text)
+        return DownloadError(ValueError, text)
     if isinstance(cause, ssl.SSLError | ssl.CertificateError) or "ClientSSLError" in names:
         certificate = getattr(error, "certificate_error", cause)
         reason = (
@@ -92,16 +92,16 @@ def _problem_of(url: str, error: Exception) -> Problem:
             or getattr(certificate, "reason", "")
             or "no TLS"
         )
-        return Problem(
+        return DownloadError(
             ConnectionError, f"no secure connection ({reason}); check the server's certificate"
         )
     if isinstance(cause, socket.gaierror):
-        return Problem(
+        return DownloadError(
             ConnectionError, "the name of the host is unknown; check the address and the network"
         )
     # Before Python 3.11, asyncio's TimeoutError is not the built-in one.
     if isinstance(cause, TimeoutError) or "TimeoutError" in names:
-        return Problem(TimeoutError, f"the server did not answer in time; {_AGAIN}")
+        return DownloadError(TimeoutError, f"the server did not answer in time; {_AGAIN}")
     answer = _problem_of_answer(names)
     if answer is not None:
         return answer
@@ -110,36 +110,38 @@ def _problem_of(url: str, error: Exception) -> Problem:
     return _problem_elsewhere(cause, text)
 
 
-def _problem_of_connection(error: Exception, text: str) -> Problem:
+def _problem_of_connection(error: Exception, text: str) -> DownloadError:
     if isinstance(error, ConnectionRefusedError):
-        return Problem(
+        return DownloadError(
             ConnectionRefusedError, "the connection was refused; check the host and the port"
         )
-    return Problem(
+    return DownloadError(
         ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}"
     )
 
 
-def _problem_of_answer(names: set[str]) -> Problem | None:
+def _problem_of_answer(names: set[str]) -> DownloadError | None:
     """Return the problem of an incomplete or invalid answer, by the type names of an
     error; None for other errors."""
     if "ClientPayloadError" in names:
-        return Problem(ConnectionError, f"the server's answer was incomplete; {_AGAIN}")
+        return DownloadError(ConnectionError, f"the server's answer was incomplete; {_AGAIN}")
     if names & {"ClientResponseError", "BadHttpMessage"}:
-        return Problem(ConnectionError, "the server's answer is not valid HTTP; check the address")
+        return DownloadError(
+            ConnectionError, "the server's answer is not valid HTTP; check the address"
+        )
     return None
 
 
-def _problem_elsewhere(error: Exception, text: str) -> Problem:
+def _problem_elsewhere(error: Exception, text: str) -> DownloadError:
     if isinstance(error, FileNotFoundError):
-        return Problem(FileNotFoundError, "there is no such file; check the address")
+        return DownloadError(FileNotFoundError, "there is no such file; check the address")
     if isinstance(error, PermissionError):
-        return Problem(
+        return DownloadError(
             PermissionError, f"reading the file is not permitted ({text}); check the credentials"
         )
     if isinstance(error, IsADirectoryError):
-        return Problem(IsADirectoryError, "expected a file, got a folder")
-    return Problem(OSError, f"expected a file, got {type(error).__name__}: {text}")
+        return DownloadError(IsADirectoryError, "expected a file, got a folder")
+    return DownloadError(OSError, f"expected a file, got {type(error).__name__}: {text}")
 
 
 def _text_of(url: str, error: Exception) -> str:
@@ -147,7 +149,7 @@ def _text_of(url: str, error: Exception) -> str:
     return cleaned(text)[:_LONGEST] or type(error).__name__
 
 
-def no_room(folder: str, error: OSError | None = None) -> Problem:
+def no_room(folder: str, error: OSError | None = None) -> DownloadError:
     """Return the problem of a disk that is too full for temporary files."""
     reason = "no space left"
     if error is not None:
@@ -155,7 +157,7 @@ def no_room(folder: str, error: OSError | None = None) -> Problem:
         name = errno.errorcode.get(error.errno or 0)
         if name is not None:
             reason += f" ({name})"
-    return Problem(
+    return DownloadError(
         OSError,
         (f"no space for the file in {folder}: {reason}; set TMPDIR to a folder with more space"),
     )

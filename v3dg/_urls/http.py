@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypedDict, TypeVar
 
 from v3dg import _extras
 from v3dg._urls.addresses import Reach, is_address, reach_of
-from v3dg._urls.failures import Problem, status_problem
+from v3dg._urls.failures import DownloadError, status_error
 from v3dg._urls.others import Write, changed, too_long
 
 if TYPE_CHECKING:
@@ -160,10 +160,10 @@ class WebSource:
             if answer.status == 200:
                 return _FileInfo(answer.content_length, _tag_of(answer))
             if answer.status not in (206, 416):
-                raise status_problem(answer.status)
+                raise status_error(answer.status)
             num_bytes = _range_of(answer).num_bytes
             if answer.status == 416 and num_bytes != 0:
-                raise status_problem(answer.status)
+                raise status_error(answer.status)
             return _FileInfo(num_bytes, _tag_of(answer))
 
     async def _read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
@@ -185,7 +185,7 @@ class WebSource:
             if answer.status == 416:
                 raise changed(first, last, 0)
             if answer.status == 200:
-                raise Problem(
+                raise DownloadError(
                     ConnectionError,
                     (
                         "the server sent parts of the file before but no longer does; try again "
@@ -193,7 +193,7 @@ class WebSource:
                     ),
                 )
             if answer.status != 206:
-                raise status_problem(answer.status)
+                raise status_error(answer.status)
             self._check_range(_range_of(answer), first, last)
             self._gives_parts = True
             await _read(answer, first, last, write)
@@ -204,17 +204,19 @@ class WebSource:
         requested one."""
         if content.num_bytes is not None and content.num_bytes != self.num_bytes:
             problem = f"one of {content.num_bytes} bytes; the file has changed, open it again"
-            raise Problem(ValueError, f"expected a file of {self.num_bytes} bytes, got {problem}")
+            raise DownloadError(
+                ValueError, f"expected a file of {self.num_bytes} bytes, got {problem}"
+            )
         if (content.first, content.last) != (first, last):
             problem = f"those from {content.first} to {content.last}; check the server"
-            raise Problem(
+            raise DownloadError(
                 ConnectionError, f"expected the bytes from {first} to {last}, got {problem}"
             )
 
     async def _read_all(self, max_bytes: int, write: Write) -> int:
         async with self._answer("GET") as answer:
             if answer.status != 200:
-                raise status_problem(answer.status)
+                raise status_error(answer.status)
             if self.num_bytes is None:
                 return await _read_to_end(answer, 0, max_bytes, write)
             await _read(answer, 0, self.num_bytes, write)
@@ -231,7 +233,7 @@ class WebSource:
         try:
             encoding = answer.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding not in ("", "identity") and answer.status < 300:
-                raise Problem(
+                raise DownloadError(
                     ConnectionError,
                     ("expected an uncompressed answer, got a compressed one; check the server"),
                 )
@@ -262,7 +264,7 @@ class WebSource:
                 return answer
             answer.close()
             url = _next_url(url, answer.headers.get("Location", ""))
-        raise Problem(
+        raise DownloadError(
             ConnectionError,
             f"expected at most {_MOST_REDIRECTS} redirects, got more; check the address",
         )
@@ -356,14 +358,14 @@ async def _checked(url: "URL", least_reach: Reach | None) -> Reach:
     return reach
 
 
-def _wrong_url() -> Problem:
+def _wrong_url() -> DownloadError:
     advice = "check the URL, and write special characters of a password as %XX"
-    return Problem(ValueError, f"expected a URL with a host; {advice}")
+    return DownloadError(ValueError, f"expected a URL with a host; {advice}")
 
 
-def _refused() -> Problem:
+def _refused() -> DownloadError:
     advice = "if the redirect is intended, use the private address directly"
-    return Problem(
+    return DownloadError(
         PermissionError, f"refused a redirect from a public server to a private address; {advice}"
     )
 
@@ -376,7 +378,7 @@ def _next_url(url: "URL", location: str) -> "URL":
     except ValueError:
         is_web = False
     if not is_web:
-        raise Problem(
+        raise DownloadError(
             ConnectionError,
             "the server redirects to something other than a web address; check the address",
         )
@@ -393,7 +395,7 @@ def _tag_of(answer: "ClientResponse") -> str:
 def _range_of(answer: "ClientResponse") -> _ContentRange:
     match = _RANGE.fullmatch(answer.headers.get("Content-Range", "").strip())
     if not match:
-        raise Problem(
+        raise DownloadError(
             ConnectionError,
             "the server sent a part of the file without its range; check the server",
         )

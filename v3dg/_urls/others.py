@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import BinaryIO, Protocol, TypeAlias, cast
 
-from v3dg._urls.failures import Problem
+from v3dg._urls.failures import DownloadError
 
 Write: TypeAlias = Callable[[bytes, int], None]
 """Writes bytes at an offset of the local file."""
@@ -87,18 +87,18 @@ class OtherSource:
         return num_bytes
 
 
-def changed(first: int, last: int, num_bytes: int) -> Problem:
+def changed(first: int, last: int, num_bytes: int) -> DownloadError:
     """Return the problem of a part whose length is not the requested one."""
     text = (
         f"expected {last - first} bytes at offset {first}, got {num_bytes}; the file has changed, "
         "open it again"
     )
-    return Problem(ValueError, text)
+    return DownloadError(ValueError, text)
 
 
-def too_long(max_bytes: int) -> Problem:
+def too_long(max_bytes: int) -> DownloadError:
     """Return the problem of a file that is larger than allowed."""
-    return Problem(
+    return DownloadError(
         ValueError,
         f"expected at most {max_bytes} bytes, got more; check the address, or download the file",
     )

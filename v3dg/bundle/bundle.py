@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -335,13 +335,30 @@ class Bundle:
         return self._pages.read(page, page + 1)
 
     @property
+    def page_layout(self) -> PageLayout:
+        """The clusters of each page."""
+        return self._layout
+
+    def code_pages(self, pages: Sequence[int]) -> list[NDArray[np.int32]]:
+        """Return pages of the codec "quantized". If the bundle has the codec "float32",
+        its gaussians are rounded.
+
+        Raises:
+            ValueError: A page is damaged, or cannot be rounded.
+            OSError: A page cannot be read.
+        """
+        return on_threads(self._pages.codes_of, pages)
+
+    @property
     def page_hashes(self) -> NDArray[np.uint8]:
         """(P, 16) the hashes of the pages in the bundle's file.
 
         Raises:
             ValueError: The bundle is not in a file.
         """
-        check("bundle", self._file is not None, "a bundle in a file, got one in memory")
+        check(
+            "bundle", self._file is not None, "a bundle in a file, got one in memory; save it first"
+        )
         assert self._file is not None
         return self._file.tables["pages.hash"]
 

@@ -246,8 +246,8 @@ class BundleFile:
         unknown = sorted(set(header) - set(expected))
         if unknown:
             self._fail(
-                f"{json_text(unknown[0])}: expected only tensors of version {self.version}, got "
-                "another one"
+                f"{json_text(unknown[0])}: expected only tensors of format version {self.version}, "
+                "got an unknown one; write the bundle again"
             )
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             is_aligned = value % self.codec.alignment == 0

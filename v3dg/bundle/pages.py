@@ -126,6 +126,10 @@ class MemoryPages:
         first, last = self.layout.first_gaussian[[first_page, last_page]].tolist()
         return self.gaussians.subset(slice(first, last))
 
+    def codes_of(self, page: int) -> NDArray[np.int32]:
+        """Return a page of the codec "quantized" with these gaussians, rounded."""
+        return encoded(self.read(page, page + 1), self.layout, page)
+
 
 class CodePages:
     """The pages of a quantised bundle whose codes are all in memory; gaussians are
@@ -134,6 +138,7 @@ class CodePages:
     def __init__(self, layout: PageLayout, words: NDArray[np.int32], codec: Codec) -> None:
         self.layout = layout
         self.codec = codec
+        self._words = words
         self.codes = _core.Codes(words, layout.first_cluster, layout.offset, codec.sh_degree)
 
     @staticmethod
@@ -153,6 +158,15 @@ class CodePages:
         """Return the gaussians of neighbouring pages."""
         clusters = np.arange(*self.layout.first_cluster[[first_page, last_page]], dtype=np.int32)
         return Gaussians(*_core.Model(self.codes, CPU.number).decode(clusters))
+
+    @cached_property
+    def _first_word(self) -> NDArray[np.int64]:
+        return offset_of(self.layout.page_bytes(self.codec) // 4)
+
+    def codes_of(self, page: int) -> NDArray[np.int32]:
+        """Return a page; it shares memory with these pages."""
+        first, last = self._first_word[[page, page + 1]].tolist()
+        return self._words[first:last]
 
 
 class FilePages:
@@ -179,6 +193,16 @@ class FilePages:
         if last_page - first_page == 1:
             self._last_page = (first_page, gaussians)
         return gaussians
+
+    def codes_of(self, page: int) -> NDArray[np.int32]:
+        """Return a page of the codec "quantized", after verifying its hash. Gaussians
+        of the codec "float32" are rounded."""
+        if self.codec.name == Codec.name:
+            return encoded(self.read(page, page + 1), self.layout, page)
+        run = self.layout.run(page, page + 1, self._file.places)
+        words = np.empty((run.places[-1] - run.places[0]) // 4, np.int32)
+        self._file.read(run, words)
+        return words
 
     def in_memory(self) -> MemoryPages | CodePages:
         """Read and verify all pages, and return them in memory."""
@@ -227,6 +251,12 @@ class JoinedPages:
             return pieces[0]
         return Gaussians.concatenate(pieces)
 
+    def codes_of(self, page: int) -> NDArray[np.int32]:
+        """Return a page of the codec "quantized"; gaussians of the codec "float32" are
+        rounded."""
+        source: Pages = self._sources[self._source[page]]
+        return source.codes_of(int(self._page[page]))
+
     def in_memory(self) -> MemoryPages | CodePages:
         """Read all pages, and return them in memory."""
         gaussians = self.read(0, self.layout.num_pages)
@@ -237,6 +267,12 @@ class JoinedPages:
 
 Pages: TypeAlias = MemoryPages | CodePages | FilePages | JoinedPages
 """The pages of a bundle: in memory, in a file, or in other bundles."""
+
+
+def encoded(gaussians: Gaussians, layout: PageLayout, page: int) -> NDArray[np.int32]:
+    """Return the gaussians of a page as a page of the codec "quantized"."""
+    clusters = layout.clusters_of(page)
+    return _core.encode_page(gaussians.rows, clusters - clusters[0])
 
 
 def on_threads(

@@ -94,7 +94,16 @@ class OnDevice(Common):
 
 
 @dataclass(kw_only=True)
-class OnPool(OnDevice):
+class OnAnyDevice(Common):
+    device: Literal["auto", "cpu", "cuda", "webgpu"] = "auto"
+    """Device that draws; auto is a CUDA device if torch can use one, otherwise the CPU.
+    webgpu draws scenes and bundles on a GPU of any maker, with the package wgpu."""
+
+
+@dataclass(kw_only=True)
+class Pooled:
+    """The option for the memory of a pool."""
+
     memory: Annotated[str, option("SIZE")] = "auto"
     """Memory of the device for pages of bundles, such as 2GB. Pages are read from the
     files as cameras need them. `all` loads everything; `auto` loads everything if it
@@ -106,6 +115,11 @@ class OnPool(OnDevice):
         if self.memory == "all":
             return None
         return self.memory
+
+
+@dataclass(kw_only=True)
+class OnPool(Pooled, OnDevice):
+    """Options of commands that draw from a pool."""
 
 
 @dataclass(kw_only=True)

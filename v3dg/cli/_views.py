@@ -31,6 +31,7 @@ from v3dg.scene.file import is_scene
 from v3dg.upright import ASSUMED, direction_of, up_of
 
 _DEFAULT_FOV = 45.0  # degrees
+_DEFAULT_SIZE = (800, 800)
 
 # Limited because all cameras are created before the first picture is drawn.
 _MOST_VIEWS = 10_000
@@ -77,9 +78,9 @@ class ViewOptions(CameraFile):
     views: Annotated[int | None, option("N")] = None
     """Number of views around an object, or around the viewer inside a room; 1 by
     default, 8 for `compare`."""
-    size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
-    """Width and height in px of pictures for which the file of the camera has no
-    size."""
+    size: Annotated[tuple[int, int] | None, option("W H")] = None
+    """Width and height in px of pictures for which the file of the camera has no size;
+    800 800 by default, and 1600 800 for pictures of all directions."""
     elevation: Annotated[float | None, option("DEGREES")] = None
     """Elevation of the cameras around the subject above the horizon in degrees; 20 by
     default."""
@@ -87,12 +88,17 @@ class ViewOptions(CameraFile):
     """The axis that points up for --eye and for views around the subject; by default
     the one in the file, or a guess."""
 
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        """The width and height of pictures of cameras without a size."""
+        return self.size or _DEFAULT_SIZE
+
     def check(self, *subjects: Path) -> None:
         """Raise an error for invalid subjects, and for options that do not apply to
         them, before anything is read."""
         for path in subjects:
             require_subject(path)
-        for side in self.size:
+        for side in self.frame_size:
             check_range("--size", side, 1, MOST_SIDE)
         for name, value in (("--target", self.target), ("--fov", self.fov)):
             check_usage(name, value is None or self.eye, "--eye together with it, got no --eye")
@@ -147,11 +153,11 @@ def choose_cameras(
     """Return the camera of --eye or --at; else the cameras of --cameras; else those of
     the subject; else first views of the subject (`views` of them by default)."""
     if options.link is not None:
-        cameras = {"link": _linked(options.link, options.size)}
+        cameras = {"link": _linked(options.link, options.frame_size)}
     elif options.eye is not None:
         cameras = {"eye": _placed(options, subject)}
     else:
-        cameras = options.read(options.size)
+        cameras = options.read(options.frame_size)
         if not cameras and own_cameras:
             options.check_turntable(f"the cameras of {shown(path)}")
             cameras = own_cameras
@@ -183,6 +189,7 @@ def _placed(options: ViewOptions, subject: Subject) -> Camera:
     """Return the camera of --eye."""
     assert options.eye is not None
     up = direction_of(options.up or up_of(subject)[0])
+    width, height = options.frame_size
     target = options.target
     if target is None:
         x, y, z = frame_subject(subject).center.tolist()
@@ -192,8 +199,8 @@ def _placed(options: ViewOptions, subject: Subject) -> Camera:
         target,
         up,
         math.radians(options.fov or _DEFAULT_FOV),
-        width=options.size[0],
-        height=options.size[1],
+        width=width,
+        height=height,
     )
 
 
@@ -222,8 +229,8 @@ def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Cam
     up = direction_of(options.up or up_of(subject)[0])
     framing = frame_subject(subject)
     if options.views is None and views == 1:
-        return {"0": framing.camera(up, *options.size, elevation=elevation)}
-    cameras = framing.turntable(up, views, *options.size, elevation=elevation)
+        return {"0": framing.camera(up, *options.frame_size, elevation=elevation)}
+    cameras = framing.turntable(up, views, *options.frame_size, elevation=elevation)
     digits = len(str(views - 1))
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
 

@@ -16,6 +16,7 @@ from v3dg import _core, _device
 from v3dg._extras import EXTRAS
 from v3dg._version import __version__
 from v3dg.cli._common import Common, print_result
+from v3dg.render.webgpu.gpu import Gpu
 
 _PATIENCE_S = 20  # time limit in seconds for the answer of a program
 
@@ -75,6 +76,7 @@ def _findings() -> Iterator[_Finding]:
     if not missing:
         status = "works"
     yield _Finding("CUDA", status, f"to draw and build on a GPU: {missing}")
+    yield _webgpu()
     for extra in EXTRAS.values():
         name = re.split(r"[\[>]", extra.requirement)[0]
         installed: str | None = None
@@ -89,6 +91,14 @@ def _findings() -> Iterator[_Finding]:
         "browser"
     )
     yield _Finding("web browser", browser, advice)
+
+
+def _webgpu() -> _Finding:
+    """Return the adapter of WebGPU."""
+    try:
+        return _Finding("WebGPU", Gpu().name, "")
+    except (ImportError, RuntimeError) as error:
+        return _Finding("WebGPU", None, f"to draw on GPUs of any maker: {error}")
 
 
 def _answer(*command: str, line: int = 0) -> str | None:

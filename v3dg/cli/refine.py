@@ -18,11 +18,10 @@ from v3dg.cameras import Camera
 from v3dg.cli import _common
 from v3dg.cli._views import CameraFile
 from v3dg.framing import frame_subject
-from v3dg.levels.unfinished import discard_units, units_folder
 from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.metrics import MIN_TRANSMITTANCE, draw_truth
 from v3dg.pictures import to_8bit
-from v3dg.refine import refine_bundle
+from v3dg.refine import refine_file
 from v3dg.render import render
 from v3dg.upright import direction_of, up_of
 
@@ -48,13 +47,13 @@ class Refine(CameraFile, _common.OnDevice):
     of more than 4 million gaussians is refined in units, each with this number."""
     cameras: Annotated[Path | None, _common.option("PATH")] = None
     """File or folder of cameras, as for `v3dg render`, such as those of the asset's
-    photographs. By default, cameras are found, see --seen-from."""
+    photographs. By default, cameras are chosen as --seen-from says."""
     seen_from: Annotated[SeenFrom, _common.option("{auto,outside,inside,both}")] = "auto"
-    """From where pictures are taken without cameras; by default, the free space that
-    the asset surrounds decides."""
+    """Where pictures are taken from if no cameras are given. By default, this depends
+    on the free space that the asset surrounds."""
     drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
-    """Share of a level's visibility that may be lost by dropping its least visible
-    gaussians; 0 keeps all."""
+    """Fraction of a level's visibility that may be lost by dropping its least visible
+    gaussians. 0 keeps all gaussians."""
     seed: int = 0
     """Seed of random numbers. The same seed gives the same file, byte for byte, on the
     same kind of device and for any number of threads."""
@@ -94,9 +93,10 @@ def run(options: Refine) -> None:
 
 
 def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
-    """Write the refined bundle, and return it, opened from its file."""
-    refined = refine_bundle(
+    """Write the refined bundle to a file, open the file, and return the bundle."""
+    return refine_file(
         bundle,
+        options.output,
         cameras=list(options.read().values()),
         seen_from=options.seen_from,
         steps=options.steps,
@@ -104,15 +104,12 @@ def _refined_file(bundle: Bundle, options: Refine) -> Bundle:
         seed=options.seed,
         device=options.device,
         progress=not options.quiet,
-        folder=units_folder(options.output),
     )
-    refined.write(options.output)
-    discard_units(options.output)
-    return Bundle.open(options.output)
 
 
 def _summary(result: JsonObject, refined: Bundle) -> str:
-    """Return the line about what was refined, and how long it took."""
+    """Return a line of text with the numbers of pictures and units, and the time that
+    the refinement took."""
     line = f"{result['output']}: {result['steps']:,} steps"
     if result["units"] > 1:
         line += f" for each of {result['units']} units and the levels above them"
@@ -158,8 +155,8 @@ def _psnr(mean_square: float) -> float:
 
 
 def _warning(rows: list[JsonObject]) -> list[str]:
-    """Return lines about the widths of pictures at which the result is worse; empty if
-    there are none."""
+    """Return lines about the picture widths at which the result is worse. Without such
+    widths, there are no lines."""
     worse = [str(row["width"]) for row in rows if row["after"] < row["before"] - _NOTICED_DB]
     if not worse:
         return []

@@ -17,7 +17,8 @@ from v3dg.cli._common import (
     Color,
     Column,
     Cut,
-    OnPool,
+    OnAnyDevice,
+    Pooled,
     check_output,
     check_range,
     check_usage,
@@ -43,11 +44,12 @@ from v3dg.spherical import EquirectangularCamera
 from v3dg.upright import direction_of
 from v3dg.video import write_video
 
+_PANORAMA_SIZE = (1600, 800)
 _MOST_SECONDS = 600.0  # the same limit as for camera paths of the viewer
 
 
 @dataclass
-class Render(Cut, OnPool):
+class Render(Cut, Pooled, OnAnyDevice):
     """Draw a scene, a bundle or an asset. The cameras are those of its file, those of
     --cameras, one at a given position, or else first views that show the whole
     subject."""
@@ -73,8 +75,8 @@ class Render(Cut, OnPool):
     """Background: red, green and blue from 0 to 1, a colour such as white or #87ceeb,
     or none for a transparent .png (straight alpha)."""
     projection: Literal["pinhole", "equirectangular"] = "pinhole"
-    """Draw the view of the camera, or all directions around it. For all directions, the
-    width in --size must be twice the height. Gaussians are then evaluated on the ray of
+    """Draw the view of the camera, or all directions around it, for which the width in
+    --size must be twice the height. Gaussians are then evaluated on the ray of
     each pixel, which needs all of them in memory. With --budget, with another
     --color-by or with a pool, the picture is combined from 26 pinholes, which is less
     exact."""
@@ -92,6 +94,11 @@ class Render(Cut, OnPool):
     @property
     def is_panorama(self) -> bool:
         return self.projection == "equirectangular"
+
+    @property
+    def panorama_size(self) -> tuple[int, int]:
+        """The width and height of pictures of all directions."""
+        return self.view.size or _PANORAMA_SIZE
 
 
 @dataclass(frozen=True)
@@ -112,7 +119,7 @@ def run(options: Render) -> None:
     options.view.check(options.subject)
     background = color_of(options.background)
     output = _checked_output(options, background)
-    device = _device.resolve(options.device)
+    device = _device.resolve_for_drawing(options.device)
     subject, own_cameras = open_subject(options.subject, show=not options.quiet)
     notes: list[str] = []
     needs_up = options.view.needs_up(own_cameras)
@@ -149,8 +156,9 @@ def run(options: Render) -> None:
 
 def _casts_rays(options: Render, renderer: Renderer) -> bool:
     """Return whether panoramas are drawn with rays, which have neither budgets nor
-    false colours, and need all gaussians in memory."""
+    false colours, need all gaussians in memory, and are not drawn by WebGPU."""
     is_plain = options.budget is None and options.color_by == "appearance"
+    is_plain = is_plain and options.device != "webgpu"
     return options.is_panorama and is_plain and renderer.memory is None
 
 
@@ -188,7 +196,7 @@ def _checked_output(options: Render, background: Color | None) -> Path:
         )
         check_range("--seconds", options.seconds, 0.1, _MOST_SECONDS)
     if options.is_panorama:
-        width, height = options.view.size
+        width, height = options.panorama_size
         fits = width == 2 * height and width >= 8
         advice = "for example, use --size 2048 1024"
         check_usage(
@@ -214,12 +222,12 @@ def _checked_output(options: Render, background: Color | None) -> Path:
 def _check_sizes(options: Render, cameras: Mapping[str, Camera]) -> None:
     """Raise an error for pictures that cannot form a film."""
     if options.is_panorama:
-        check_size("--size", *options.view.size)
+        check_size("--size", *options.panorama_size)
     if not options.is_film:
         return
     sizes = {(camera.width, camera.height) for camera in cameras.values()}
     if options.is_panorama:
-        sizes = {options.view.size}
+        sizes = {options.panorama_size}
     width, height = min(sizes)
     fits = len(sizes) == 1 and width % 2 == 0 and height % 2 == 0
     texts = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)[:3])
@@ -278,7 +286,7 @@ def _drawn(
 
     casts_rays = _casts_rays(options, renderer)
     direction = direction_of(style.up)
-    panorama_width = options.view.size[0]
+    panorama_width = options.panorama_size[0]
     for name, camera in counted(cameras.items(), len(cameras), "render", show):
         faces.clear()
         image: Image

@@ -112,7 +112,7 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
     check(
         display_path,
         len(text) <= _MOST_BYTES,
-        f"a record of at most {_MOST_BYTES >> 20} MiB, got more",
+        f"a record of at most {_MOST_BYTES >> 20} MiB, got more; remove the file",
     )
     try:
         document = Node(parse_json(text), str(display_path), "")

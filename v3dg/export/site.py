@@ -105,7 +105,7 @@ def write_site(
     is_scene = isinstance(content, Scene)
     axes = _axes(up or up_of(content, cameras)[0], is_scene=is_scene)
     turn = turn_upright(axes.asset)
-    check("scene", len(scene), "at least one instance to export, got none")
+    check("scene", len(scene), "at least one instance to export, got none; add an instance")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
     names = ["."]
     certain = [SITE, "index.html", INDEX, SETTINGS]

@@ -129,7 +129,7 @@ def write_tiles(
     scene = _common.exported(scene, "3D Tiles")
     root = np.eye(4)
     root[:3, :3] = _common.rotation_to(up or up_of(content)[0], "z")
-    check("scene", len(scene), "at least one instance to export, got none")
+    check("scene", len(scene), "at least one instance to export, got none; add an instance")
     for bundle in scene.bundles:
         check("bundle", bundle.num_gaussians, "at least one gaussian to export, got none")
     names = _common.names_of(scene, reserved=[CESIUM])

@@ -63,7 +63,7 @@ def write_usd(
     pxr = usd.pxr()
     scene = Scene.of(content)
     scene = _common.exported(scene, "OpenUSD")
-    check("scene", len(scene), "at least one instance to export, got none")
+    check("scene", len(scene), "at least one instance to export, got none; add an instance")
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")
     stage.SetDefaultPrim(world.GetPrim())

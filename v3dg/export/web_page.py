@@ -91,7 +91,7 @@ def write_web_page(
     _check_core()
     content, cameras = _common.opened_with_cameras(subject, Path(folder), cameras)
     scene = copy.copy(Scene.of(content))
-    check("scene", len(scene), "at least one instance to export, got none")
+    check("scene", len(scene), "at least one instance to export, got none; add an instance")
     axis = up or up_of(content, cameras)[0]
     scene.up = axis
     if not cameras:

@@ -92,7 +92,8 @@ def _with_sparse(
     numbers = _rows(document, places, kind, (count, 1), is_strided=False)[:, 0].astype(np.int64)
     is_ascending = bool((np.diff(numbers) > 0).all()) and numbers[-1] < num_rows
     if not is_ascending:
-        raise places.problem(f"expected ascending indices below {num_rows}, got others")
+        problem = f"expected ascending indices below {num_rows}, got others; correct the file"
+        raise places.problem(problem)
     values = _rows(
         document, sparse.field("values"), rows.dtype, (count, rows.shape[1]), is_strided=False
     )

@@ -127,7 +127,8 @@ def _local_matrix(node: Node) -> Floats | None:
             raise node.problem(f"expected a matrix or {parts[0]}, got both")
         matrix = np.array(node.field("matrix").vector(16)).reshape(4, 4).T
         if not np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=1e-6):
-            raise node.problem("expected a matrix with the last row 0 0 0 1, got another")
+            last = " ".join(f"{value:g}" for value in matrix[3])
+            raise node.problem(f"expected a matrix with the last row 0 0 0 1, got {last}")
     else:
         matrix = np.eye(4)
         if node.has("rotation"):

@@ -433,7 +433,8 @@ class _Unpickler:
                 break
             if not (self._push(opcode.name, argument) or self._combine(opcode.name)):
                 operation = f"pickle operation {opcode.name}"
-                raise ValueError(f"one with the {operation}, which this reader does not allow")
+                advice = "save it as .ply with the trainer"
+                raise ValueError(f"one with the {operation}, which is not allowed; {advice}")
         return self._stack.pop()
 
     def _push(self, operation: str, argument: _Value) -> bool:
@@ -503,7 +504,8 @@ def _allowed_name(argument: str) -> _Named:
     module, _, name = argument.partition(" ")
     short = f"{module[:60]}.{name[:60]}"
     if module not in _ALLOWED_MODULES:
-        raise ValueError(f"one whose pickle refers to {short}, which this reader does not allow")
+        advice = "save it as .ply with the trainer"
+        raise ValueError(f"one that refers to {short}, which is not allowed; {advice}")
     return _Named(short)
 
 
@@ -526,7 +528,7 @@ def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
         or not isinstance(key, str)
         or not len(shape) == len(strides) <= _MAX_DIMENSIONS
     ):
-        raise ValueError("one with a tensor whose shape is not plain numbers")
+        raise ValueError("one with a tensor whose shape is damaged")
     if kind not in _TYPES:
         return _Named(kind)
     return _Tensor(kind, key, num_stored, offset, shape, strides)

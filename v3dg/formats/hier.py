@@ -93,7 +93,11 @@ def _leaves(path: AnyPath, nodes: NDArray[np.void], count: int) -> NDArray[np.in
     size = nodes["leaves"][has_leaves].astype(np.int64)
     end = first + size
     fits = (size > 0) & (first >= 0) & (end <= count)
-    check(path, fits.all(), f"nodes whose leaves are among the {count} gaussians, got others")
+    check(
+        path,
+        fits.all(),
+        f"nodes whose leaves are among the {count} gaussians, got others; is the file damaged?",
+    )
     num_starts = np.bincount(first, minlength=count + 1)
     num_ends = np.bincount(end, minlength=count + 1)
     return np.flatnonzero(np.cumsum(num_starts - num_ends)[:count] > 0)

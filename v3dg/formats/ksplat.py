@@ -188,7 +188,8 @@ def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _S
     full_sizes = np.full(section.num_full_buckets, section.bucket_size, np.int64)
     ends = np.cumsum(np.minimum(np.concatenate([full_sizes, partial_sizes]), count))
     is_enough = not count or (len(ends) and ends[-1] >= count)
-    check(path, is_enough, f"buckets for all {count} gaussians of section {number}, got too few")
+    expected = f"buckets for all {count} gaussians of section {number}, got too few"
+    check(path, is_enough, f"{expected}; is the file damaged?")
     bucket_from_row = np.searchsorted(ends, np.arange(count), side="right")
     bucket = np.dtype((np.void, section.bucket_bytes))
     buckets_start = start + 4 * section.num_partial_buckets

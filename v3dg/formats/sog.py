@@ -278,7 +278,7 @@ def _decoded(
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would also try other formats
 
     width, height = _size_of_webp(content)
-    check(path, width, f"a WebP picture in {name!a}, got another file")
+    check(path, width, f"a WebP picture in {name!a}, got another kind of file")
     has_size = num_pixels <= width * height <= _MAX_PIXELS_FACTOR * num_pixels + _FREE_PIXELS
     expected = f"{num_pixels} pixels"
     if row is not None:
@@ -291,7 +291,7 @@ def _decoded(
         WebPImageFile(io.BytesIO(content)) as picture,
     ):
         if picture.size != (width, height):
-            raise ValueError(f"a picture of {picture.size} pixels")
+            raise ValueError("one whose header and content differ in size")
         return np.asarray(picture.convert("RGBA"))
 
 

@@ -90,7 +90,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         # Without this check, a small file could repeat rows any number of times.
         count = len(gaussians)
         fits = sum(len(run) for run in rows) <= count and max(run.stop for run in rows) <= count
-        check(path, fits, f"at most {count} gaussians from {str(name)!a}, got more")
+        check(path, fits, f"at most {count} gaussians from {str(name)!a}, got more; is it damaged?")
         parts.append(
             gaussians.subset(np.concatenate([np.arange(run.start, run.stop) for run in rows]))
         )

@@ -184,7 +184,7 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
             asset_from_instance.append(asset_from_path[path_of_prim])
             poses.append(_similarity(prim, matrix))
         if not assets:
-            raise ValueError("no gaussians in it")
+            raise ValueError("a file without gaussians")
         up = usd.UsdGeom.GetStageUpAxis(root.GetStage()).lower()
         return assets, asset_from_instance, poses, up
 
@@ -512,7 +512,7 @@ def export(stage: Usd.Stage, path: AnyPath) -> None:
             with value_errors(path, "a .usdz to be written"):
                 is_made = usd.UsdUtils.CreateNewUsdzPackage(os.fspath(layer), os.fspath(file))
                 if not is_made:
-                    raise ValueError("none; write a .usdc instead")
+                    raise ValueError("an error of OpenUSD; write a .usdc instead")
         shutil.copyfile(file, temporary)
 
 

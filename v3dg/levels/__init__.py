@@ -52,26 +52,28 @@ def build_bundle(
     number of threads. Other instruction sets or kinds of GPU round differently.
 
     Args:
-        asset: Gaussians, at least one of which can be drawn; or a file, as for
-            `read_asset`.
+        asset: Gaussians, at least one of which can be drawn, or the path of a file that
+            `read_asset` can read.
         config: Settings; the defaults of `BuildConfig` if None.
         seed: Seed of the random views that groups are fitted to.
         progress: True shows a bar with the level, the number of fitted groups, the
-            remaining time and the mean loss, or prints four lines if stderr is not a
-            terminal. A function is called with the number of fitted gaussians, the
-            total, and a text; an exception that it raises ends the build. The four
-            lines are always logged, as INFO of the logger `v3dg`.
+            remaining time and the mean loss. If stderr is not a terminal, it prints
+            four lines instead. A function is called with the number of fitted
+            gaussians, the total, and a text; an exception that it raises ends the
+            build. The four lines are always logged, as INFO of the logger `v3dg`.
         device: The device that computes; the bundle is always on the host. "cuda" means
-            the asset's CUDA device, or else the current one, and all other devices of
-            its kind. "auto" means "cuda" if torch can use CUDA, otherwise the CPU.
-        resume_path: The file of the bundle. The build writes each level there, and
-            opens the bundle from there at the end. A build of the same asset, config,
-            seed and device continues from the levels in the file.
-        unusable: What happens to gaussians with invalid values (not finite, negative
-            scales, opacities outside 0 to 1): they are left out, with a
+            the asset's CUDA device, or else the current one, together with all other
+            devices of its kind. "auto" means "cuda" if torch can use CUDA, otherwise
+            the CPU.
+        resume_path: The file of the bundle. The build writes each level to it and, at
+            the end, opens the bundle from it. If the file has levels of an earlier
+            build of the same asset with the same config, seed and device, the build
+            continues from them.
+        unusable: What to do with gaussians that have invalid values (not finite,
+            negative scales, opacities outside 0 to 1). They are either left out, with a
             `v3dg.cleaning.AssetWarning`, or raise an error. Invisible gaussians, whose
             opacity is below 1/255, are always left out. The bundle's config stores the
-            number of each kind as "dropped".
+            number of gaussians with each fault as "dropped".
         executor: The executor whose workers build, such as
             `dask.distributed.Client.get_executor()`; by default threads of this
             process. The workers need devices of the same kind as this process, which
@@ -80,20 +82,23 @@ def build_bundle(
         codec: The codec of the bundle, see `v3dg.Bundle`. With a lossy codec, levels
             are fitted to the rounded gaussians of the levels below them.
         quality: "draft" leaves the levels as they are built. "standard" then refines
-            them together (`v3dg.refine_bundle`) with 18,000 pictures and one more for
-            every 100 gaussians, for each unit: seconds on a GPU, minutes on a CPU.
-            "best" uses five times as many pictures. docs/levels.md has the time and the
-            gain of each. None means "standard" on a GPU and "draft" on a CPU, and for a
-            config without steps. An asset whose refinement does not fit in the free
-            memory is then a draft, too, with a `v3dg.levels.DraftWarning`. The levels
-            at `resume_path` stay unrefined, and the refined bundle is in memory.
-        seen_from: From where a refinement takes its pictures, see `v3dg.refine_bundle`.
+            them together (`v3dg.refine_bundle`). For each unit, it uses 18,000 pictures
+            and one more for every 100 gaussians, which takes seconds on a GPU and
+            minutes on a CPU. "best" uses five times as many pictures. docs/levels.md
+            has the time and the gain of each. None means "standard" on a GPU, and
+            "draft" on a CPU or for a config without steps. If there is too little free
+            memory to refine the asset, None also means "draft", with a
+            `v3dg.levels.DraftWarning`. The levels at `resume_path` stay unrefined, and
+            the refined bundle is in memory.
+        seen_from: Where the pictures of a refinement are taken from; see
+            `v3dg.refine_bundle`.
 
     Raises:
         ValueError: The asset has no gaussian that can be drawn, or a setting is wrong.
         RuntimeError: The device is "cuda" and cannot be used; another build is using
-            `resume_path`; a worker has a device of another kind; or a worker ended.
-        OSError: `resume_path` cannot be written; finished levels stay there.
+            `resume_path`; a worker has a device of another kind; or a worker ended
+            unexpectedly.
+        OSError: `resume_path` cannot be written. Finished levels are kept in it.
         MemoryError: The device has too little memory; the message states the required
             amount.
         KeyboardInterrupt: Ctrl-C was pressed; all threads have stopped, and finished

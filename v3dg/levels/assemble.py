@@ -18,7 +18,7 @@ def assemble(
     """Return the tables of all levels, in order."""
     levels = plan.levels
     num_clusters = [level.num_clusters for level in levels]
-    # A bundle has no groups of level 0.
+    # No groups are simplified to level 0.
     num_groups = [0, *(level.num_groups for level in levels[1:])]
     sizes = np.concatenate([np.diff(level.offset) for level in levels])
     level = np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters)
@@ -55,8 +55,8 @@ def assemble(
 def _groups_from(
     counts: Sequence[int], num_groups: Sequence[int], num_up: int
 ) -> npt.NDArray[np.int32]:
-    """Return, for each row of every level, the group `num_up` levels higher that
-    contains it; -1 without such a group.
+    """Return, for each row of every level, the index of the group that contains it
+    `num_up` levels higher, or -1 if there is none.
 
     The rows are clusters or groups; `counts` has their number for each level. Each
     group of a level contains the same number of rows.

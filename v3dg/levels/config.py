@@ -7,19 +7,19 @@ from typing import Annotated, Literal, NoReturn, get_args, get_origin
 from v3dg._numbers import check, refuse
 from v3dg.gaussians import TRAINED_FILTER_PX2
 
-# Maximum side of a target picture, px. Drawing one cannot be interrupted; up to this
-# size it takes less than about a second.
+# Maximum side of a target picture, px. Drawing a picture cannot be interrupted, but
+# takes less than about a second up to this size.
 _MOST_SIDE = 8192
-# Maximum number of samples along the side of a pixel in target pictures; more do not
-# improve the fits.
+# Maximum number of samples along the side of a pixel in target pictures. More samples
+# do not improve the fits.
 _MOST_SAMPLES = 8
-_DEEP = 64  # a level deep enough to use `_MOST_SAMPLES`
-# Limit on the pixels of all views of a group together. Each thread that fits a group
-# stores them, 16 bytes each.
+_DEEP = 64  # a level that is high enough to use `_MOST_SAMPLES`
+# Maximum number of pixels in all views of a group together. Each thread that fits a
+# group stores them, with 16 bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
-# For each type of a setting: the Python types that are accepted, and what error
-# messages call them.
+# For each type of a setting, the Python types that are accepted, and the name of the
+# type in error messages.
 _KINDS: dict[type, tuple[tuple[type, ...], str]] = {
     int: ((int,), "a whole number"),
     float: ((int, float), "a number"),
@@ -35,69 +35,73 @@ class BuildConfig:
     """The settings of a build. docs/levels.md explains the defaults; `paper()` returns
     the settings of V3DG.
 
-    The type of each number is annotated with its smallest and largest value. Integers
-    have 32 bits in the core. The others are float32: squares and products of them must
-    be finite, and divisors must not be 0.
+    The annotation of each number has its smallest and largest value. Integers have 32
+    bits in the core. Floats are stored as float32, so the ranges ensure that squares
+    and products are finite, and that divisors are not 0.
 
     Attributes:
         cluster_size: Maximum number of gaussians in a cluster of level 0.
         group_size: Number of clusters that are simplified together, a power of two.
             With 2, the groups form a binary tree.
-        min_clusters: Minimum number of clusters in a level; coarser levels are not
+        min_clusters: Minimum number of clusters in a level. No levels with fewer are
             built.
-        min_gaussians: Minimum number of gaussians in a level; coarser levels are not
+        min_gaussians: Minimum number of gaussians in a level. No levels with fewer are
             built.
-        init: How a coarser cluster is initialised: "merge" similar gaussians in pairs,
-            or "prune" the less important half.
+        init: How a coarser cluster is initialised. "merge" merges similar gaussians in
+            pairs; "prune" removes the less important half.
         prune_growth: Factor for the scales of gaussians that survive pruning.
-        targets: The level whose pictures a level is fitted to: the "finest" level below
-            whose detail is visible in its views, or the "previous" one.
+        targets: The level that a level is fitted to. "finest" is the lowest level whose
+            detail is visible in the views; "previous" is the level below.
         steps: Maximum number of steps of Adam for each group; 0 keeps the initial
             gaussians.
-        first_steps: Steps at level 1; each level has twice as many as the one below, up
-            to `steps`.
+        first_steps: Number of steps at level 1. It doubles with each level, up to
+            `steps`.
         views_per_step: Number of views in one step.
-        num_views: Number of views of a group, drawn once; 0 draws a new random view
-            each time.
-        supersample: The factor by which targets of level 1 are drawn larger before box
-            averaging. It grows by one every two levels, up to 8, because higher levels
-            show finer gaussians. With targets of the previous level it does not grow.
-        image_size: Side of the views in px; 0 shows a group at the size at which it is
+        num_views: Number of views of a group. They are drawn once. 0 draws a new random
+            view each time.
+        supersample: The factor by which targets of level 1 are drawn larger, before
+            they are averaged. It grows by one every two levels, up to 8, because the
+            targets of higher levels have more detail per pixel. If `targets` is
+            "previous", it does not grow.
+        image_size: Side of the views, px. 0 shows a group at the size at which it is
             selected.
-        px2_per_gaussian: The size at which views show a group: px² of its footprint for
-            each gaussian that it is simplified to.
+        px2_per_gaussian: The size at which views show a group, as the px² of its
+            footprint divided by the number of gaussians that it is simplified to.
         distance: Distance from the camera to the centre of the group, in radii of the
             group.
         filter_px2: Variance, px², of the low-pass filter of the coarser levels. The
-            last level has at least the variance of a pixel, 1/12, unless this is 0.
+            last level has at least the variance of a pixel, 1/12, unless this setting
+            is 0.
         smooth: Whether the asset is smooth: its gaussians are about as wide as the
-            distances between them, so that one sample per pixel suffices when they are
-            seen from near. Coarser levels of a smooth asset have no filter, except the
-            last one, which has that of a pixel. A group of level 1 is then selected
-            where pictures of the asset show that it looks no worse than its leaves, or
-            at half the size if there are more than a million leaves. With "measured",
-            and if levels are fitted with a filter, a measurement decides: some groups
-            of level 1 are fitted with 0.05 px² and without a filter, and the asset is
-            smooth if the filter hardly improves it. An asset of mostly faint gaussians
-            then has no filter, either, because it would lose alpha.
-        asset_filter_px2: The filter of level 0. None means no filter, or the filter of
-            the training if the asset is antialiased. The filter used for training (0.3
-            for the original 3DGS) suits pictures of the size of the photographs;
-            without a filter, the asset looks better from farther away. Coarser levels
-            are always fitted to the asset without a filter.
+            distances between them, so that one sample per pixel suffices in close
+            views. Coarser levels of a smooth asset have no filter, except the last one,
+            whose filter has the variance of a pixel. A group of level 1 is then
+            selected at the sizes at which measured pictures of it look no worse than
+            its leaves. With more than a million leaves, nothing is measured, and level
+            1 is selected at half the size. "measured" finds out whether an asset is
+            smooth, if levels are fitted with a filter: some groups of level 1 are
+            fitted with a filter of 0.05 px² and without one. If the filter hardly
+            improves them, the asset is smooth. If most of the asset is faint, coarser
+            levels have no filter either, because it would reduce their alpha.
+        asset_filter_px2: The filter of level 0. With None, it has the filter of the
+            training if the asset is antialiased, and otherwise none. The filter that
+            was used for training (0.3 for the original 3DGS) suits pictures of the size
+            of the photographs; without a filter, the asset looks better from farther
+            away. Coarser levels are always fitted to the asset without a filter.
         asset_antialiased: Whether the asset was trained with opacities that compensate
             for its filter. None uses the asset's own value (`Gaussians.antialiased`),
-            or False if that is None.
+            or False if the asset has none.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
         loss_cells: Weight of the L1 distances between means of cells of 4 x 4 px,
-            relative to those between pixels. A fit by pixels alone leads to medians,
-            which thin out what is faint or sparse.
+            relative to those between pixels. It counteracts a bias: a fit by pixels
+            alone leads to medians, which are too low where the picture is faint or
+            sparse.
         step_position: Step size of positions, in radii of the group, or in world units
-            if `position_in_world`. `step_log_scale`, `step_quat`, `step_logit`,
+            if `position_in_world` is true. `step_log_scale`, `step_quat`, `step_logit`,
             `step_sh0` and `step_sh_rest` are the step sizes of log scales, quaternions,
             opacity logits, and SH coefficients of degree 0 and of higher degrees.
-        final_step: The factor by which the step sizes have decayed exponentially at the
-            last step.
+        final_step: Ratio of the last step size to the first. Step sizes decay
+            exponentially.
         beta2: Decay of Adam's running mean of squared gradients.
 
     Raises:
@@ -108,27 +112,27 @@ class BuildConfig:
     cluster_size: Annotated[int, (2, 1 << 30)] = 256
     group_size: Annotated[int, (2, 1 << 30)] = 2
     # Only Python code reads these counts, so they may exceed 32 bits. With the largest
-    # values, level 0 is the only level.
+    # values, the bundle has only level 0.
     min_clusters: Annotated[int, (1, 1 << 62)] = 1
     min_gaussians: Annotated[int, (1, 1 << 62)] = 1
     init: Literal["merge", "prune"] = "merge"
-    # The growth of one level.
+    # This is the growth per level.
     prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)
     targets: Literal["finest", "previous"] = "finest"
-    # A fit with the largest value takes hours.
+    # With the maximum, a fit takes hours.
     steps: Annotated[int, (0, 1_000_000)] = 600
     first_steps: Annotated[int, (0, 1_000_000)] = 150
-    # The limit exists because a step cannot be interrupted.
+    # The maximum exists because a step cannot be interrupted.
     views_per_step: Annotated[int, (1, 1024)] = 2
-    # All views are drawn before the first step.
+    # There is a maximum because all views are drawn before the first step.
     num_views: Annotated[int, (0, 1 << 16)] = 64
     # Up to 64 x 64 samples are averaged in each pixel.
     supersample: Annotated[int, (1, 64)] = 3
     image_size: Annotated[int, (0, _MOST_SIDE)] = 0
-    # At the upper bound, a gaussian covers about 1000 x 1000 px.
+    # With the maximum, a gaussian covers about 1000 x 1000 px.
     px2_per_gaussian: Annotated[float, (0.001, 1_000_000)] = 2.0
-    # The lower bound keeps the camera outside the ball. Beyond the upper bound, float32
-    # depths are spaced more widely than gaussians are.
+    # The minimum keeps the camera outside the ball. Beyond the maximum, the spacing of
+    # float32 depths would exceed that of gaussians.
     distance: Annotated[float, (1.1, 1000)] = 4.0
     filter_px2: _Weight = 0.05
     smooth: Literal["measured", "yes", "no"] = "measured"
@@ -198,8 +202,8 @@ class BuildConfig:
         )
 
     def _view_side(self, num_gaussians: int) -> int:
-        """Return the side, px, of a view of a group of `num_gaussians`, as fit_view()
-        of the core chooses it."""
+        """Return the side, px, of a view of a group of `num_gaussians`. The core's
+        fit_view() chooses the same side."""
         x2 = self.distance**-2
         footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
         radius2 = num_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
@@ -229,9 +233,10 @@ class BuildConfig:
     def levels_at_once(self, first: int, end: int) -> range:
         """Return the levels before `end` that are fitted together with level `first`.
 
-        The lowest levels are seen most, so each of them starts from the fitted level
-        below. The levels above have few groups and would take long one after another;
-        so they are initialised together, by repeated merging of the last fitted level.
+        The lowest levels are drawn most often, so each of them starts from the fitted
+        level below. The levels above have few groups, so fitting them one after another
+        would take long. They are initialised together, by repeated merging of the last
+        fitted level.
         """
         end = min(end, first + self._visible_levels)
         stop = first + 1
@@ -242,16 +247,16 @@ class BuildConfig:
 
     @property
     def _visible_levels(self) -> int:
-        """The number of levels below a level whose detail its target pictures show:
-        down to gaussians about as small as half a sample."""
+        """The number of lower levels whose detail the target pictures of a level show.
+        Gaussians smaller than about half a sample are not visible."""
         px2 = self.px2_per_gaussian
         if self.image_size > 0:  # the ball covers about 0.4 of the picture
             px2 = 0.4 * self.image_size**2 / (self.cluster_size * self.group_size / 2)
         return 1 + max(1, math.ceil(math.log2(px2 * self.supersample**2)))
 
     def of_asset(self, *, antialiased: bool | None) -> "BuildConfig":
-        """Return these settings with the filter of an asset filled in; `antialiased` is
-        the asset's own declaration, None without one."""
+        """Return these settings with the filter of the asset. `antialiased` is the
+        asset's own declaration, or None if there is none."""
         if self.asset_antialiased is not None:
             antialiased = self.asset_antialiased
         filter_px2 = self.asset_filter_px2
@@ -262,8 +267,8 @@ class BuildConfig:
         return replace(self, asset_antialiased=bool(antialiased), asset_filter_px2=filter_px2)
 
     def contradiction(self, *, antialiased: bool | None) -> str:
-        """Return a description of the contradiction between these settings and the
-        asset's own declaration; empty if they agree."""
+        """Describe how these settings contradict the asset's own declaration. Return an
+        empty text if they agree."""
         setting = self.asset_antialiased
         if setting is None or antialiased is None or setting == antialiased:
             return ""
@@ -286,7 +291,7 @@ class BuildConfig:
 
     @staticmethod
     def leaves_only() -> "BuildConfig":
-        """Return settings that make level 0 the only level."""
+        """Return settings with which a bundle has only level 0."""
         return BuildConfig(min_clusters=1 << 31)
 
     @staticmethod
@@ -294,10 +299,10 @@ class BuildConfig:
         """Return the settings of the paper and its code (V3DG, sections 3.2 and 5.1),
         with `changes` to them.
 
-        They are: 4,096 gaussians per cluster and two clusters per group; stop at two
-        clusters; prune, and grow scales by 2^(1/6); 640 new random views of 64 x 64 px
-        at four radii, compared with the previous level without a filter; a loss of 0.8
-        L1 + 0.2 D-SSIM + 0.1 alpha.
+        There are 4,096 gaussians per cluster and two clusters per group, and levels end
+        at two clusters. Gaussians are pruned, and scales grow by 2^(1/6). Fits use 640
+        new random views of 64 x 64 px from a distance of four radii, compared with the
+        previous level without a filter. The loss is 0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
         """
         config = BuildConfig(
             cluster_size=4096,

@@ -1,4 +1,4 @@
-"""The quality of a build for which none is named."""
+"""Chooses the quality of a build if the user names none."""
 
 import warnings
 
@@ -11,21 +11,19 @@ from v3dg.levels.refine_sizes import refine_bytes
 
 
 class DraftWarning(UserWarning):
-    """The levels of a build stay as they are built, where those of a smaller asset
-    would be refined."""
+    """Too little memory is free to refine the levels, so they stay unrefined."""
 
 
 def chosen_quality(
     quality: Quality | None, config: BuildConfig, leaves: Leaves, device: Device, memory: int
 ) -> Quality:
-    """Return the quality of a build: the named one; else "standard" on a GPU that fits
-    levels, and "draft" elsewhere.
+    """Return the quality of a build. If no quality is named, it is "standard" on a GPU
+    that fits levels, and otherwise "draft".
 
     Args:
         memory: Bytes of the host that the build may use.
 
-    Warns:
-        DraftWarning: Too little memory is free to refine the asset.
+    Warns: DraftWarning: Too little memory is free to refine the asset.
     """
     if quality is not None:
         return quality

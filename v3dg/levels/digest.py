@@ -1,4 +1,4 @@
-"""The digest of an asset; docs/format.md has its definition."""
+"""Computes the digest of an asset, which docs/format.md defines."""
 
 import os
 from collections.abc import Iterable
@@ -15,10 +15,9 @@ asset depends on this number."""
 
 
 def digest_of(asset: Gaussians) -> str:
-    """Return the digest of an asset, which does not depend on the file that it was read
-    from."""
+    """Return the digest of an asset. It does not depend on the format of its file."""
     pieces = pieces_of(asset.numpy())
-    # A few pieces are hashed faster than threads start, and starting threads can fail
+    # Hashing a few pieces takes less time than starting threads, which can also fail
     # when memory is short.
     if len(pieces) <= 3:
         return digest_of_hashes(map(hash_of, pieces))
@@ -27,7 +26,7 @@ def digest_of(asset: Gaussians) -> str:
 
 
 def pieces_of(gaussians: Gaussians) -> list[Gaussians]:
-    """Cut gaussians into pieces that share their memory."""
+    """Divide gaussians into pieces, which share their memory."""
     return [
         gaussians.subset(slice(start, start + PIECE)) for start in range(0, len(gaussians), PIECE)
     ]

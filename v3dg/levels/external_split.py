@@ -1,8 +1,8 @@
 """The median split of more points than fit in memory.
 
-A node that does not fit in memory is split in passes over its points: one finds the
-longest side of its box, two find the median along that axis (the upper and the lower
-half of its bits), and one moves the points.
+A node that does not fit in memory is split in four passes over its points. The first
+finds the longest side of its box. The next two find the median along that axis: one the
+upper half of its bits, one the lower half. The last pass moves the points.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,8 @@ WordFile = RowFile[np.uint32]
 FITTING_BYTES = 48
 """Bytes per point of a node that is split in memory."""
 
-_AT_ONCE = 1 << 18  # points that are read at a time: 16 MB, including intermediate arrays
+# points that are read at a time; this uses 16 MB, with intermediate arrays
+_AT_ONCE = 1 << 18
 
 
 def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) -> Points:
@@ -63,8 +64,8 @@ def _split_in_memory(points: Points, depth: int) -> Words:
 
 
 def _partition(source: WordFile, first: int, middle: int, last: int, target: WordFile) -> None:
-    """Write the lower half of a node from `first` on and the upper half from `middle`
-    on, preserving the order."""
+    """Write the lower half of a node from position `first` on, and the upper half from
+    position `middle` on. Both keep their order."""
     axis = _longest_axis(source, first, last)
     median, num_ties = _median(source, first, middle, last, axis)
     ends = [first, middle]
@@ -86,14 +87,13 @@ def _longest_axis(source: WordFile, first: int, last: int) -> int:
         means = points[:, :3].view(np.float32)
         low = np.minimum(low, means.min(axis=0))
         high = np.maximum(high, means.max(axis=0))
-    # The core, too, compares float32 lengths and takes the first of several equal
-    # sides.
+    # Like the core, compare lengths as float32, and take the first of equal sides.
     return int(np.argmax(high - low))
 
 
 def _median(source: WordFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
-    """Return the greatest key of the lower half, in the order of `_ordered`, and how
-    many points of the lower half have this key."""
+    """Return the largest key of the lower half, as numbered by `_ordered`, and how many
+    points of the lower half have this key."""
 
     def keys() -> Iterator[Words]:
         return (_ordered(points[:, axis]) for points in source.blocks(first, last, _AT_ONCE))
@@ -105,8 +105,8 @@ def _median(source: WordFile, first: int, middle: int, last: int, axis: int) -> 
 
 
 def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
-    """Return the 16-bit value at a rank, counted from 1, in ascending order, and the
-    rank among the values that equal it."""
+    """Return the 16-bit value with a given rank (from 1) in ascending order, and its
+    rank among the equal values."""
     counts = np.zeros(1 << 16, np.int64)
     for block in values:
         counts += np.bincount(block, minlength=1 << 16)
@@ -116,8 +116,8 @@ def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
 
 
 def _ordered(bits: Words) -> Words:
-    """Return numbers that compare like the floats with these bits; zeros of both signs
-    are equal."""
+    """Return integers that have the same order as the floats with these bits. Zeros of
+    both signs are equal."""
     bits = (bits.view(np.float32) + np.float32(0)).view(np.uint32)
     sign = bits >> 31
     return np.asarray(bits ^ ((np.uint32(0) - sign) | np.uint32(1 << 31)))

@@ -52,21 +52,21 @@ def build_file(
     """Build the bundle of an asset from its file, or from several files that form one
     asset, and write it to a file.
 
-    The unfinished bundle is at `levels_path`. An asset that does not fit in memory is
-    sorted in a scratch folder beside that file.
+    The unfinished bundle is written to `levels_path`. An asset that does not fit in
+    memory is sorted in a scratch folder next to that file.
 
     Args:
         asset: The content of the asset's file, if it is already in memory.
-        resume: Keep an existing bundle if its config says that it was built from these
-            gaussians with these settings, and continue from the levels of an
-            interrupted build. If false, everything is built again.
+        resume: True keeps an existing bundle if its config says that it was built from
+            these gaussians with these settings. It also continues from the levels of an
+            interrupted build. False builds everything again.
         memory: Host memory that the build may use in addition to the current use of the
-            process: bytes, or text like "8GiB". Default: half of the free memory.
+            process, as bytes or text like "8GiB". The default is half of the free
+            memory.
         up: The axis of the asset that points up, which the bundle stores for viewers
-            and exports.
-        config, seed, progress, device, unusable, executor, codec, quality, seen_from:
-            See `build_bundle`. A build that is interrupted during the refinement leaves
-            the levels as they are built.
+            and exports. config, seed, progress, device, unusable, executor, codec,
+            quality, seen_from: See `build_bundle`. If a build is interrupted during the
+            refinement, the levels stay as they were built.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
@@ -109,7 +109,7 @@ def _checked_config(config: BuildConfig | None) -> BuildConfig:
 
 
 def _check_output(bundle_path: Path) -> None:
-    """Raise an error early if no bundle can be written to this path."""
+    """Raise an error before the build if no bundle can be written to this path."""
     _files.check_bundle_name(bundle_path)
     _files.make_folder(bundle_path)
     _files.status_of_replaced(bundle_path)
@@ -163,12 +163,15 @@ class _FileBuild:
         )
 
     def run(self, source: AbstractContextManager[Leaves], *, resume: bool) -> tuple[Bundle, bool]:
-        """Keep or build the bundle; return it, and whether it was built."""
+        """Return the finished bundle, and whether it was built.
+
+        If a finished bundle exists, it is kept.
+        """
         with source as leaves:
             config = leaves.settings(self.config)
             quality = chosen_quality(self.quality, config, leaves, self.devices[0], self.num_bytes)
             if resume and self._is_finished(leaves, config, quality):
-                # A RuntimeError means that another build is writing this file.
+                # A RuntimeError here means that another build is writing this file.
                 with suppress(RuntimeError):
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
@@ -205,8 +208,8 @@ class _FileBuild:
         )
 
     def _is_finished(self, leaves: Leaves, config: BuildConfig, quality: Quality) -> bool:
-        """Return whether the bundle exists, was built from these leaves with these
-        settings, and has not been converted to another codec."""
+        """Return whether the bundle exists and was built from these leaves with these
+        settings. A bundle that was converted to another codec later does not count."""
         settings = made_with(leaves, config, self.seed, self.codec, self.up)
         request = refinement_of(
             quality, leaves.num_gaussians, leaves.sh_degree, settings["seed"], self.seen_from
@@ -216,7 +219,8 @@ class _FileBuild:
             if request is not None:
                 settings = refined_settings(request, bundle, settings)
             return bundle.config == settings and bundle.codec == self.codec
-        except (ValueError, OSError):  # missing, damaged, or of another version: build it again
+        # missing, damaged, or of another version, so it is built again
+        except (ValueError, OSError):
             return False
 
 
@@ -233,11 +237,11 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
-    """Return the path of the unfinished bundle, which `build_file` writes and from
-    which an interrupted build continues."""
+    """Return the path of the unfinished bundle. `build_file` writes it, and continues
+    an interrupted build from it."""
     path = Path(bundle_path)
-    # The finished bundle replaces the target of a link, so the unfinished one is beside
-    # the target.
+    # The finished bundle replaces the target of a link, so the unfinished one is next
+    # to the target.
     if path.is_symlink():
         path = Path(os.path.realpath(path))
     return path.with_name(path.name + ".partial")

@@ -1,4 +1,4 @@
-"""The fits of the core: their settings, and how they run while Ctrl-C and the progress
+"""Runs the fits of the core with the right settings. Meanwhile, Ctrl-C and the progress
 display keep working."""
 
 import _thread
@@ -58,7 +58,9 @@ def run_fit(
     has_ended = threading.Event()
 
     def work(token: _Token) -> None:
-        del token  # the running thread itself keeps its arguments alive until it ends
+        # The running thread keeps its arguments alive until it ends, so this is not the
+        # last reference.
+        del token
         try:
             run()
         except BaseException as error:
@@ -66,8 +68,8 @@ def run_fit(
         finally:
             has_ended.set()
 
-    # threading.Thread is not used: start() would wait forever if the thread ends before
-    # its first line for lack of memory; and after Ctrl-C during join(), Python 3.11 may
+    # threading.Thread has two faults here. If the thread ends before its first line for
+    # lack of memory, start() waits forever. After Ctrl-C during join(), Python 3.11 may
     # treat a running thread as finished.
     tokens = [_Token()]
     running_token = weakref.ref(tokens[0])
@@ -91,4 +93,4 @@ def run_fit(
 
 
 class _Token:
-    """An object that is destroyed together with the thread that holds it."""
+    """An object that lives as long as the thread that holds it."""

@@ -1,5 +1,5 @@
-"""The leaves of a build: the gaussians of an asset that can be drawn, in the order of
-the median split."""
+"""The leaves of a build: the drawable gaussians of an asset, in the order of the median
+split."""
 
 import threading
 import warnings
@@ -35,13 +35,13 @@ class Leaves(ABC):
     sh_degree: int
     dropped: dict[str, int]
     digest: str
-    resident_bytes: int  # host memory that the leaves occupy while they are read
+    resident_bytes: int  # host memory that the leaves use while they are read
     up: Axis | None  # the axis that points up, if the asset's file declares it
     antialiased: bool | None  # as in `Gaussians`
 
     def settings(self, config: BuildConfig) -> BuildConfig:
-        """Return the settings of a build of these leaves; emit an AssetWarning if
-        `config` contradicts what the asset declares."""
+        """Return the settings for building these leaves. Emit an AssetWarning if
+        `config` contradicts a declaration of the asset."""
         contradiction = config.contradiction(antialiased=self.antialiased)
         if contradiction:
             warnings.warn(f"asset: {contradiction}", cleaning.AssetWarning, stacklevel=3)
@@ -54,7 +54,7 @@ class Leaves(ABC):
 
 class MemoryLeaves(Leaves):
     """The leaves of an asset in memory, on any device. The first call of `read` sorts
-    them by a median split, on `device`."""
+    them on `device`."""
 
     def __init__(
         self,
@@ -104,8 +104,8 @@ class MemoryLeaves(Leaves):
 def made_with(
     leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None
 ) -> JsonObject:
-    """Return the config that a bundle stores: the number, the digest and the faults of
-    the asset's gaussians, and the settings of the build."""
+    """Return the config that a bundle stores. It has the number of the asset's
+    gaussians, their digest and their faults, and the settings of the build."""
     seed = whole_number(seed, "seed")
     check("seed", 0 <= seed < 2**58, f"a whole number from 0 to 2^58 - 1, got {value_text(seed)}")
     result: JsonObject = {
@@ -125,8 +125,8 @@ def made_with(
 
 
 class Tally:
-    """Counts the gaussians of an asset, and the faults of those that cannot be drawn,
-    one part of the asset at a time."""
+    """Counts the gaussians of an asset, and the faults of those that cannot be drawn.
+    The asset is passed in parts."""
 
     def __init__(self) -> None:
         self.num_gaussians = 0
@@ -135,7 +135,10 @@ class Tally:
         self._counts: Counter[str] = Counter()
 
     def add(self, part: Gaussians) -> npt.NDArray[np.bool_]:
-        """Count the gaussians of a part; return (N,) whether each can be drawn."""
+        """Count the gaussians of a part.
+
+        Return (N,) whether each of them can be drawn.
+        """
         findings = cleaning.examine(part)
         self.num_gaussians += len(part)
         self.num_drawable += int(findings.drawable.sum())
@@ -148,8 +151,8 @@ class Tally:
         return {kind: self._counts[kind] for kind in cleaning.KINDS if kind in self._counts}
 
     def check(self, unusable: Unusable) -> None:
-        """Raise ValueError for an asset that cannot be built, and warn about gaussians
-        that are left out."""
+        """Warn about gaussians that are left out. Raise ValueError if no bundle can be
+        built from the asset."""
         text = cleaning.summary(
             self.num_gaussians - self.num_drawable, self.num_gaussians, self.counts
         )

@@ -1,7 +1,7 @@
 """The leaves of an asset in one or many files, which need not fit in memory.
 
 An asset that does not fit in memory is read twice, in blocks. The first pass writes its
-means to scratch files, where they are split (`external_split`) down to *buckets*: nodes
+means to scratch files. There they are split (`external_split`) down to *buckets*, nodes
 that are small enough to be sorted when they are read. The second pass writes every
 gaussian to its bucket. docs/results.md lists the amounts of data that are read and
 written.
@@ -41,10 +41,11 @@ from v3dg.levels.scratch import RowFile, scratch_folder
 MOST_GAUSSIANS = 1 << 32
 """An asset must have fewer gaussians than this."""
 
-_MOST_IN_BUCKET = 1 << 18  # a quarter of a build unit, so that few unneeded gaussians are read
-# Larger blocks are not faster, because their rows are read in random order.
+# a quarter of a build unit, so that few gaussians are read in vain
+_MOST_IN_BUCKET = 1 << 18
+# Larger blocks would not be faster, because their rows are read in random order.
 _MOST_IN_BLOCK_BYTES = 1 << 28
-_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket at a time
+_SENT_AT_ONCE = 1 << 12  # number of gaussians that a thread writes to a bucket at once
 _OVERHEAD_BYTES = 24 << 20
 _CHANGED = (
     "a file that does not change during the build, got different content when it was read again; "
@@ -103,10 +104,10 @@ def leaves_on_disk(
     The leaves are in the order of the median split of the whole asset, which does not
     depend on the memory. `reserved` returns the memory that other work needs, given the
     number of gaussians and the SH degree. An asset of more than `most_in_memory`
-    gaussians is sorted on disk even if it fits in memory. The scratch folder is created
-    only if it is needed, and removed at the end.
+    gaussians is sorted on disk even if it fits in memory. The scratch folder is only
+    created if it is needed, and is removed at the end.
     """
-    files = map(open_asset, paths)  # lazy, so that few files are open at once
+    files = map(open_asset, paths)  # lazy, so that few files are open at the same time
     tiles = list(map(_Tile.of, files))
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}; divide it")
@@ -115,7 +116,7 @@ def leaves_on_disk(
     folder = Path(folder)
     fits = count <= min(sizes.in_memory, most_in_memory)
     scratch: AbstractContextManager[None] = nullcontext()
-    # A folder that a killed build has left is removed in any case.
+    # Remove a folder that a killed build has left, even if it is not needed.
     if not fits or os.path.lexists(folder):
         scratch = scratch_folder(folder, _NAMES)
     if fits:
@@ -147,7 +148,7 @@ def _check_disk(folder: Path, num_bytes: int) -> None:
 
 
 class _Tile(NamedTuple):
-    """The header of one of the asset's files."""
+    """One of the asset's files, and its header."""
 
     path: str | os.PathLike[str]
     num_gaussians: int
@@ -175,13 +176,13 @@ class _Tile(NamedTuple):
 
 
 def _antialiased(tiles: Sequence[_Tile]) -> bool | None:
-    """Return whether the gaussians of all files were trained with antialiasing; None if
-    that is unknown or differs between files."""
+    """Return whether the gaussians of all files were trained with antialiasing. Return
+    None if that is unknown or differs between files."""
     return common([tile.antialiased for tile in tiles])
 
 
 class _Sizes(NamedTuple):
-    """The maximum number of gaussians: in memory at once, in a block, in a node that is
+    """Maximum numbers of gaussians: in memory at once, in a block, in a node that is
     split, and in a bucket."""
 
     in_memory: int
@@ -191,10 +192,10 @@ class _Sizes(NamedTuple):
 
     @staticmethod
     def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> "_Sizes":
-        """Return the sizes for `memory` bytes; raise ValueError if the memory is too
+        """Return the sizes for `memory` bytes. Raise ValueError if the memory is too
         small."""
         gaussian = gaussian_bytes(degree)
-        # A piece of a block is decoded in double precision, in addition to the block.
+        # While a piece of a block is decoded, it also needs memory in double precision.
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
         largest = max(tiles, key=lambda tile: tile.whole_bytes)
         required = reserved + overhead + largest.whole_bytes + PIECE * gaussian
@@ -223,8 +224,8 @@ class _Sizes(NamedTuple):
 
 
 def _bytes_in_bucket(degree: int) -> int:
-    """Return the memory per gaussian of a bucket that is being sorted: two copies of
-    the gaussian, and the split."""
+    """Return the memory per gaussian while a bucket is sorted: two copies of the
+    gaussian, and the split."""
     return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
 
 
@@ -235,8 +236,8 @@ def scratch_bytes(count: int, degree: int) -> int:
 
 
 def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
-    """Yield the asset in blocks that fill the buffer, each with the index of its first
-    gaussian. The next block overwrites the buffer."""
+    """Fill the buffer with one block of the asset after another. Yield each block with
+    the index of its first gaussian."""
     first = 0
     filled = 0
     for tile in tiles:
@@ -252,13 +253,13 @@ def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
                 yield first, buffer
                 first += filled
                 filled = 0
-        del file  # free a completely read file before the next one is opened
+        del file  # free a file that is read before the next one is opened
     if filled:
         yield first, buffer.subset(slice(0, filled))
 
 
 def _put_rows(rows: npt.NDArray[np.float32], out: Gaussians, start: int) -> None:
-    """Copy gaussians that are rows of a file to `out`, from gaussian `start` on."""
+    """Copy gaussians from rows of a file to `out`, beginning at gaussian `start`."""
     column = 0
     for array in vars(out).values():
         width = math.prod(array.shape[1:])
@@ -328,8 +329,8 @@ def _name_of(tiles: Sequence[_Tile]) -> str:
 
 
 def _write_points(blocks: _Blocks, points: external_split.WordFile, tally: Tally) -> str:
-    """Run the first pass: write the means of the drawable gaussians with their rows in
-    the asset; return the digest."""
+    """Run the first pass: write the means of the drawable gaussians and their rows in
+    the asset. Return the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for first, block in blocks:
@@ -351,7 +352,7 @@ def _write_rows(
     rows: RowFile[np.float32],
 ) -> str:
     """Run the second pass: write every gaussian to its bucket, in the order of the
-    asset; return the digest."""
+    asset. Return the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for number, (first, block) in enumerate(blocks):
@@ -368,7 +369,7 @@ def _write_rows(
                     index = (
                         order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
                     )
-                    # take() releases the GIL, unlike indexing with brackets.
+                    # take() releases the GIL, which indexing with brackets does not.
                     rows.write(
                         start,
                         np.concatenate([array.take(index, axis=0) for array in arrays], axis=1),
@@ -384,8 +385,8 @@ def _ends_in_buckets(
     block: int,
     asset_gaussians: int,
 ) -> npt.NDArray[np.int64]:
-    """Return (B, blocks + 1) positions in `order` for B buckets: where the bucket
-    starts, then where its gaussians from each block end."""
+    """Return (B, blocks + 1) positions in `order` for B buckets: the start of the
+    bucket, then the end of its gaussians from each block."""
     counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
     for bucket, (begin, end) in enumerate(
         zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)

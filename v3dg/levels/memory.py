@@ -15,21 +15,21 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.whole import UNIT_LEAVES
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-# Host memory for each leaf of a unit until the levels are written: a constant number of
-# bytes, plus this many copies of the gaussian. A unit of 1,048,576 leaves took 380
-# bytes per leaf at SH degree 0, where a gaussian has 56 bytes, and 870 bytes at degree
-# 3, where a gaussian has 236.
+# Host memory per leaf of a unit, until its levels are written: a constant number of
+# bytes, plus this many copies of the gaussian. It was measured for a unit of 1,048,576
+# leaves: 380 bytes per leaf at SH degree 0, where a gaussian has 56 bytes, and 870
+# bytes at degree 3, where it has 236.
 _LEAF_BYTES = 320
 _LEAF_COPIES = 2.5
 
 
 def in_bytes(memory: int | str | None) -> int:
-    """Return an amount of memory in bytes, given bytes or text like "8GiB"; half of the
-    free memory for None."""
+    """Convert bytes, or text like "8GiB", to an amount of memory in bytes. None means
+    half of the free memory."""
     if memory is None:
         return free_bytes() // 2
     is_amount = isinstance(memory, str | int | float | np.number) and not isinstance(memory, bool)
-    # Python may refuse to print a very long integer.
+    # Python may refuse to convert a very long integer to text.
     is_long = isinstance(memory, int) and memory.bit_length() > 128
     text = ""
     if is_amount and not is_long:
@@ -43,8 +43,8 @@ def in_bytes(memory: int | str | None) -> int:
 
 
 def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
-    """Return the memory of a renderer's pool: bytes, "auto", or None; raise ValueError
-    for other values."""
+    """Check the memory of a renderer's pool, and return it: bytes, "auto", or None.
+    Raise ValueError for other values."""
     if memory is None:
         return None
     if isinstance(memory, str) and memory == "auto":
@@ -53,7 +53,10 @@ def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
 
 
 def most_units(memory: int, leaves: Leaves) -> int:
-    """Return how many units may be in memory together with the leaves; at least one."""
+    """Return how many units may be in memory together with the leaves.
+
+    It is at least one.
+    """
     return max(
         1, (memory - leaves.resident_bytes) // unit_bytes(leaves.num_gaussians, leaves.sh_degree)
     )
@@ -67,7 +70,7 @@ def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
 
 
 def in_mib(num_bytes: int) -> str:
-    """Return a number of bytes as text for messages, rounded up."""
+    """Return a number of bytes as text for messages. The value is rounded up to MiB."""
     return f"{-(-num_bytes >> 20):,} MiB"
 
 
@@ -82,10 +85,10 @@ def free_on(device: Device) -> int:
 
 
 def free_bytes() -> int:
-    """Return the free memory in bytes: of the system, or of the container of the
-    process if the container has less."""
+    """Return the free memory in bytes. In a container, this is at most what the
+    container has free."""
     free = _system.available_memory()
-    with suppress(OSError, ValueError):  # no cgroup, or the limit is "max"
+    with suppress(OSError, ValueError):  # no cgroup, or no limit ("max")
         group = Path("/sys/fs/cgroup")
         limit = int((group / "memory.max").read_text())
         used = int((group / "memory.current").read_text())

@@ -19,18 +19,18 @@ Offsets = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class LevelPlan:
-    """One level, or neighbouring groups of it: G groups, each of which is simplified to
-    the same number of clusters; C clusters in total.
+    """A level, or neighbouring groups of one. There are G groups and C clusters, and
+    each group is simplified to the same number of clusters.
 
-    At level 0 every cluster counts as a group.
+    At level 0, every cluster counts as a group.
     """
 
-    first_group: int  # index of the first group, in the level of the whole asset
+    first_group: int  # index of the first group in the level of the whole asset
     offset: Offsets  # (C + 1,) boundaries of the clusters' gaussians
     # (G + 1,) boundaries of the gaussians that each group is simplified to.
     group_offset: Offsets
     leaf_offset: Offsets  # (G + 1,) boundaries of the leaves under each group
-    # (G,) the metric of a group is its footprint times this weight.
+    # (G,) a group's metric is its footprint times this weight
     weight: npt.NDArray[np.float32]
 
     @property
@@ -63,10 +63,10 @@ class LevelPlan:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A plan: the levels of a whole asset, or of a subtree of it.
+    """The levels of a whole asset, or of a subtree of it.
 
-    All numbers of clusters and groups are powers of two, so groups nest evenly:
-    neighbouring groups contain a whole number of groups of every lower level.
+    All numbers of clusters and groups are powers of two, so groups nest evenly: the
+    boundaries of groups are also boundaries of groups in every lower level.
     """
 
     levels: tuple[LevelPlan, ...]
@@ -98,8 +98,8 @@ class Plan:
         return Plan(tuple(levels))
 
     def units(self, most_leaves: int) -> "list[Plan]":
-        """Divide the plan into parts that share no page, each with at most
-        `most_leaves` leaves if possible."""
+        """Divide the plan into parts that share no page. If possible, each has at most
+        `most_leaves` leaves."""
         num_units = (
             1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
         )
@@ -118,7 +118,8 @@ class Plan:
 
     @property
     def first_page(self) -> list[int]:
-        """The index of the first page of each level, followed by the number of pages.
+        """The index of the first page of each level. The last element is the number of
+        pages.
 
         The page of a group contains the clusters that the group replaces.
         """
@@ -138,8 +139,8 @@ class Plan:
 
 
 def _next_shape(lower: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
-    """Return the number of groups that a level's clusters form, and the number of
-    clusters that each group makes.
+    """Return the number of groups of a level, and the number of clusters that each
+    group is simplified to.
 
     The result is None after the last level.
     """
@@ -166,10 +167,10 @@ def _level_above(lower: LevelPlan, num_groups: int, clusters_made: int) -> Level
 
 
 def halved(sizes: npt.NDArray[np.int64], depth: int) -> Offsets:
-    """Return the offsets of the parts that result from splitting nodes of these sizes
-    in two, `depth` times.
+    """Return the offsets of parts. The nodes of these sizes are split in two `depth`
+    times.
 
-    The halves have the same sizes as in `_core.median_split`.
+    The sizes of the halves are the same as in `_core.median_split`.
     """
     for _ in range(depth):
         sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()

@@ -13,7 +13,7 @@ class Stopped(Exception):
 
 
 class Bar(_progress.Bar):
-    """One bar for all levels. It advances by fitted gaussians, because the time is
+    """One bar for all levels. It counts fitted gaussians, because the time is
     proportional to their number."""
 
     def __init__(self, plan: Plan, initial: int, progress: Progress) -> None:
@@ -27,11 +27,11 @@ class Bar(_progress.Bar):
         self._is_stopped = False
 
     def stop(self) -> None:
-        """Make every thread that shows progress raise `Stopped` from now on."""
+        """Make every thread that reports progress raise `Stopped` from now on."""
         self._is_stopped = True
 
     def show_of(self, part: int) -> Show:
-        """Return the progress callback for the fits of a part."""
+        """Return the progress callback for the fits of one part."""
 
         def show(
             levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress

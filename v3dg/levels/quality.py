@@ -1,4 +1,4 @@
-"""The qualities of a build: whether, and for how long, it refines its levels
+"""The qualities of a build, which decide whether and for how long levels are refined
 together."""
 
 import contextlib
@@ -17,21 +17,21 @@ from v3dg.levels.viewpoints import RECORDED, SeenFrom
 
 Quality = Literal["draft", "standard", "best"]
 
-# Number of pictures of a "standard" refinement: the first number, plus one for every
-# 100 gaussians. A large asset needs more because each picture shows a smaller part of
-# it.
+# Number of pictures of a "standard" refinement: this minimum, plus one for every 100
+# gaussians. A large asset needs more pictures, because each shows a smaller part of it.
 _LEAST_PICTURES = 18_000
 _GAUSSIANS_PER_PICTURE = 100
-# "best" uses this many times the pictures of "standard".
+# "best" uses this many times as many pictures as "standard".
 _BEST = 5
-# The time for which each of two kinds of pictures is measured, for an estimate.
+# To estimate the time, each of two kinds of pictures is drawn for this long.
 _SECONDS_OF_TRIAL = 0.25
 
 
 def refinement_of(
     quality: Quality, num_gaussians: int, sh_degree: int, seed: int, seen_from: SeenFrom = "auto"
 ) -> RefineRequest | None:
-    """Return the refinement for an asset of this many gaussians; None for a draft."""
+    """Return the refinement for an asset of this many gaussians, or None for a
+    draft."""
     one_of(quality, "quality", get_args(Quality))
     one_of(seen_from, "seen_from", get_args(SeenFrom))
     if quality == "draft":
@@ -46,9 +46,9 @@ def refinement_of(
 
 
 def refined_settings(request: RefineRequest, bundle: Bundle, settings: JsonObject) -> JsonObject:
-    """Return the config of a bundle that was built with these settings and then
-    refined. Entries that follow from its gaussians, such as eyes, are those of the
-    bundle."""
+    """Return the config of a bundle after building and refining it with these settings.
+    Entries that depend on the gaussians, such as the number of eyes, are copied from
+    the bundle."""
     if bundle.num_levels < 2:
         return settings
     record = request.record()
@@ -59,8 +59,8 @@ def refined_settings(request: RefineRequest, bundle: Bundle, settings: JsonObjec
 
 
 def pictures_of(quality: Literal["standard", "best"], num_gaussians: int, sh_degree: int) -> int:
-    """Return the number of pictures by which an asset of this many gaussians is
-    refined; that of each unit if it is refined in several."""
+    """Return the number of pictures for refining an asset of this many gaussians. If it
+    is refined in several units, this is the number for each."""
     leaves = unit_leaves(num_gaussians, sh_degree)
     pictures = _LEAST_PICTURES + leaves // _GAUSSIANS_PER_PICTURE
     if quality == "best":
@@ -69,8 +69,8 @@ def pictures_of(quality: Literal["standard", "best"], num_gaussians: int, sh_deg
 
 
 def estimated_seconds(bundle: Bundle, device: Device) -> float:
-    """Return about how long a standard refinement of a bundle takes on a device, from
-    the first pictures of one, or of its first unit."""
+    """Estimate how long a standard refinement of a bundle takes on a device. It is
+    extrapolated from its first pictures, or from those of its first unit."""
     pictures = pictures_of("standard", bundle.num_leaves, bundle.sh_degree)
     division = divided(bundle, most_leaves(bundle.sh_degree))
     if division is not None:
@@ -91,8 +91,8 @@ def estimated_seconds(bundle: Bundle, device: Device) -> float:
             work(Cuts(bundle, (), 0, device, stop))
         return (time.perf_counter() - start) / max(count[0], 1)
 
-    # The first pictures of a refinement each draw the asset, too, which most others do
-    # not; those that weigh gaussians do not draw it.
+    # At the beginning, each picture of a refinement also draws the asset, which most
+    # later pictures do not. Pictures that weigh gaussians never draw it.
     cut = trial(lambda cuts: cuts.weights(_LEAST_PICTURES))
     cut_and_asset = trial(lambda cuts: cuts.refined(_LEAST_PICTURES, steps))
     of_asset = max(cut_and_asset - cut, 0.0) / steps.cuts_per_view

@@ -1,12 +1,13 @@
-"""How many gaussians are refined together, and the memory that this takes."""
+"""Decides how many gaussians are refined together, and how much memory this takes."""
 
 from v3dg.gaussians import gaussian_bytes
 
-# Largest number of gaussians of level 0 in a unit: so many that there are few faces
-# between units, and so few that a unit needs little memory. The bits of a refined
-# bundle depend on this number and on the next one.
+# Maximum number of gaussians of level 0 in a unit. With larger units, there are fewer
+# boundaries between them; smaller units need less memory. The bits of a refined bundle
+# depend on this number and on the next one.
 UNIT_LEAVES = 1 << 22
-# Memory that a unit may take on the host, and again on a GPU, in bytes.
+# Memory, in bytes, that a unit may use on the host. It may use the same amount again on
+# a GPU.
 _UNIT_BYTES = 10_000_000_000
 # A refinement needs memory for this many copies of all levels. All levels together have
 # about twice as many gaussians as the asset.
@@ -14,7 +15,7 @@ _COPIES = 6
 
 
 def most_leaves(sh_degree: int) -> int:
-    """Return the largest number of gaussians of level 0 that are refined together."""
+    """Return the maximum number of gaussians of level 0 that are refined together."""
     num_leaves = UNIT_LEAVES
     while num_leaves > 1 and _bytes_of(num_leaves, sh_degree) > _UNIT_BYTES:
         num_leaves //= 2
@@ -37,7 +38,7 @@ def unit_leaves(num_gaussians: int, sh_degree: int) -> int:
 
 def refine_bytes(num_gaussians: int, sh_degree: int) -> int:
     """Return the memory, in bytes, that the refinement of an asset needs on the host.
-    It needs as much again on a GPU."""
+    It needs the same amount again on a GPU."""
     return _bytes_of(unit_leaves(num_gaussians, sh_degree), sh_degree)
 
 

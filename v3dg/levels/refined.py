@@ -1,6 +1,6 @@
 """Refines the levels of a bundle together, by comparing pictures of cuts with pictures
-of the asset. In a cut, gaussians of different groups hide each other; fits of single
-groups do not show that."""
+of the asset. In a cut, gaussians of different groups hide each other, which fits of
+single groups cannot show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,27 +24,27 @@ from v3dg.levels.viewpoints import SeenFrom
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
-# Step sizes of a refinement as a fraction of those of a fit. The fraction is small,
+# Step sizes of a refinement, as a fraction of those of a fit. The fraction is small,
 # because a refinement starts from fitted levels.
 _RATE = 0.2
-# Default share of a level's visibility that may be lost by dropping its least visible
-# gaussians.
+# Default fraction of a level's visibility that may be lost by dropping its least
+# visible gaussians.
 DROP = 0.02
-# Number of pictures that measure how visible each gaussian is.
+# Number of pictures for measuring how visible each gaussian is.
 _NUM_WEIGHING_PICTURES = 2_000
-# The visibility of a gaussian counts as known if at least this many of the pictures
-# have it in their cuts. Each picture shows only a part of a very large asset, so some
+# The visibility of a gaussian counts as known if it is in the cuts of at least this
+# many pictures. Pictures of a very large asset show only a part of it, so some
 # gaussians are in fewer cuts.
 _LEAST_LOOKS = 8
 
 
 @dataclass(frozen=True)
 class RefineRequest:
-    """What a refinement does to a bundle; `v3dg.refine_bundle` has the meanings.
+    """The settings of a refinement; `v3dg.refine_bundle` explains them.
 
     Attributes:
-        steps: Number of pictures that are compared; that of each unit if the bundle is
-            refined in several.
+        steps: Number of pictures that are compared. If the bundle is refined in several
+            units, this is the number for each.
     """
 
     steps: int
@@ -54,8 +54,8 @@ class RefineRequest:
     cameras: tuple[Camera, ...] = ()
 
     def num_pictures(self, device: Device) -> tuple[int, int]:
-        """Return the number of pictures that measure the weights of gaussians, and the
-        number of those by which gaussians move."""
+        """Return the number of pictures for weighing gaussians, and the number of
+        pictures for moving them."""
         num_weighing = 0
         if self.drop > 0:
             num_weighing = _NUM_WEIGHING_PICTURES
@@ -83,13 +83,12 @@ def with_refined_levels(
     first_level: int = 1,
     target_px2: float = 0.0,
 ) -> Bundle:
-    """Return the bundle with levels that are refined together, from level `first_level`
-    on.
+    """Return the bundle with refined levels. Levels below `first_level` stay as they
+    are.
 
     Args:
-        text: What the progress bar shows.
-        target_px2: The filter with which level 0 is drawn as the target; 0 for an
-            asset.
+        text: The text in the progress bar.
+        target_px2: The filter of level 0, which is the target. It is 0 for an asset.
     """
     if request.drop > 0:
         bundle = without_unseen(
@@ -118,11 +117,11 @@ def without_unseen(
     *,
     first_level: int = 1,
 ) -> Bundle:
-    """Return the bundle without the least visible gaussians of each level from
-    `first_level` on.
+    """Return the bundle without the least visible gaussians of each level, beginning
+    with level `first_level`.
 
-    `drop` is the share of a level's visibility, as measured in pictures of cuts, that
-    may be lost.
+    `drop` is the fraction of a level's visibility that may be lost. Visibility is
+    measured in pictures of cuts.
     """
     cuts = Cuts(bundle, cameras, seed, device, progress)
     weights, looks = cuts.weights(_NUM_WEIGHING_PICTURES)
@@ -132,18 +131,18 @@ def without_unseen(
 
 @dataclass(frozen=True)
 class RefineSteps:
-    """How a refinement compares cuts with the asset, and how it moves gaussians.
+    """How cuts are compared with the asset, and how gaussians are moved.
 
     Attributes:
-        windows: Number of windows (rectangular parts of pictures) whose gradients make
-            one step, 1 to 32.
+        windows: Number of windows (rectangular parts of pictures) whose gradients are
+            used in one step, 1 to 32.
         cuts_per_view: Number of cuts that are compared with each picture of the asset,
             1 to 128.
-        rate: Step sizes, as fractions of those of a fit, of a gaussian that appears in
-            one of the windows. They grow with the square root of the number of windows
+        rate: Step sizes as a fraction of those of a fit, for a gaussian that appears in
+            one window. Step sizes grow with the square root of the number of windows
             that show the gaussian.
-        window_means: Weight of the difference between the means of a window and of the
-            asset there, relative to the differences of pixels.
+        window_means: Weight of the difference between the mean of a window and the mean
+            of the asset in it, relative to the differences of pixels.
     """
 
     windows: int
@@ -153,8 +152,8 @@ class RefineSteps:
 
 
 def default_steps(device: Device) -> RefineSteps:
-    """Return the default steps for a kind of device: a GPU is busy only with several
-    windows at once, a CPU with one."""
+    """Return the default steps for a kind of device. A single window keeps a CPU busy,
+    but not a GPU."""
     if device.is_cuda:
         return RefineSteps(windows=16, cuts_per_view=4)
     return RefineSteps(windows=1)
@@ -207,9 +206,10 @@ class Cuts:
         first_level: int = 1,
         target_px2: float = 0.0,
     ) -> Gaussians:
-        """Refine the gaussians from level `first_level` on with this number of
-        pictures, rounded up to whole steps, and return all; the progress bar shows the
-        text. Level 0 is the target, drawn with the filter `target_px2`."""
+        """Refine the gaussians of all levels from `first_level` on, and return the
+        gaussians of all levels. The number of pictures is rounded up to whole steps.
+        `text` is shown in the progress bar. Level 0 is the target, drawn with the
+        filter `target_px2`."""
         clusters = self._bundle.clusters
         radius = np.append(self._bundle.groups.ball[:, 3], np.float32(0))[clusters.own_group]
         radius[clusters.level < first_level] = 0  # these gaussians do not move
@@ -233,8 +233,8 @@ class Cuts:
         return self._gaussians.numpy()
 
     def weights(self, num_pictures: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
-        """Return how visible each gaussian is in some pictures, and how many of the
-        pictures have it in their cuts."""
+        """Return how visible each gaussian is in some pictures, and how many of their
+        cuts contain it."""
         weigh = partial(_core.weigh_cuts, config=self._config(num_pictures, _RATE))
         return self._run("weigh", num_pictures, weigh)
 
@@ -267,10 +267,11 @@ class Cuts:
 def _without_least(
     bundle: Bundle, weight: npt.NDArray[np.float64], share: float, first_level: int = 1
 ) -> Bundle:
-    """Drop the gaussians of least weight from each level from `first_level` on, up to a
-    share of the level's total weight.
+    """Drop the gaussians with the smallest weights from each level, beginning with
+    level `first_level`. The dropped weights add up to at most this fraction of the
+    level's total weight.
 
-    Gaussians whose weight is NaN stay, and are not counted in the total.
+    Gaussians whose weight is NaN are kept, and do not count in the total.
     """
     offset = bundle.clusters.offset
     is_kept = np.ones(bundle.num_gaussians, bool)

@@ -47,7 +47,8 @@ def refined_bundle(
     Args:
         devices: Devices of the same kind. Each refines one unit at a time.
         folder: Where finished units are stored, so that another call continues from
-            them; None keeps them in memory. The result reads its pages from there.
+            them; None keeps them in memory. The result reads its pages from there. The
+            caller has locked it (`locked_units`).
     """
     if bundle.num_levels < 2 or bundle.num_leaves == 0:
         return bundle

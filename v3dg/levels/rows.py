@@ -1,4 +1,4 @@
-"""The order of the gaussians inside a cluster."""
+"""Defines the order of the gaussians inside a cluster."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels.plan import Offsets
 
 RUN_ROWS = 32
-"""Number of gaussians in a run. Gaussians in a run are close together in space. A warp
-of a GPU processes a run at once."""
+"""Number of gaussians in a run. They are close together in space, and a warp of a GPU
+processes them at once."""
 
 
 def in_runs(gaussians: Gaussians, offset: Offsets) -> Gaussians:
-    """Order the gaussians of each cluster such that every run of RUN_ROWS gaussians is
-    a part of the cluster's median split.
+    """Order the gaussians of each cluster such that each run of RUN_ROWS gaussians is a
+    part of the cluster's median split.
 
     Gaussians that already have this order keep it.
 

@@ -1,11 +1,11 @@
-"""Checks that the dask scheduler behind an executor still answers, so that no build
-waits for it forever.
+"""Checks that the dask scheduler of an executor still answers, so that a build does not
+wait for it forever.
 
-A dask client with an open connection sends messages and waits for results. It does not
-notice that a scheduler has stopped, for example because its machine hangs. So a small
+While a dask client has an open connection, it waits for results. It does not notice
+when the scheduler stops, for example because its machine hangs. Therefore a small
 request is sent to the scheduler repeatedly while units are built. Only a silent
-scheduler ends a build: units may take as long as they need, and the scheduler itself
-detects workers that die.
+scheduler ends a build: units may take any time, and the scheduler itself detects
+workers that die.
 """
 
 import asyncio
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A working scheduler has a single thread, which may be busy for a long time with the
-# graphs of other clients.
+# A scheduler has only one thread, which may be busy with the graphs of other clients
+# for a long time.
 _MOST_SILENCE_S = 120.0
 _TICK_S = 5.0  # time between two requests
 _ADVICE = "check that it runs; finished units are kept, and a resumed build continues from them"
 
 
 class SchedulerError(RuntimeError):
-    """Raised if a scheduler does not answer, or has dropped the units of the build."""
+    """The scheduler does not answer, or has dropped the units of the build."""
 
 
 class Watch:
-    """Detects a scheduler that no longer answers, while its client waits for results.
+    """Detects a scheduler that no longer answers while its client waits for results.
 
     Attributes:
         name: The scheduler's name in error messages.
@@ -44,15 +44,15 @@ class Watch:
         self._silent_s = 0.0
 
     def note_answer(self) -> None:
-        """Note the arrival of a result, which counts as an answer."""
+        """Record that a result has arrived, which counts as an answer."""
         self._silent_s = 0.0
 
     def tick(self) -> None:
-        """Record that `_TICK_S` seconds have passed; raise SchedulerError if the
-        scheduler has been silent for more than `_MOST_SILENCE_S`.
+        """Record that `_TICK_S` seconds have passed. Raise SchedulerError if the
+        scheduler has not answered for more than `_MOST_SILENCE_S`.
 
-        Ticks are counted, and no clock is read, so that times in which this process
-        itself was stopped do not count.
+        Ticks are counted instead of reading a clock, so that the time in which this
+        process itself was stopped does not count.
         """
         self._silent_s += _TICK_S
         if self._question is not None and self._question.done():
@@ -71,20 +71,20 @@ async def _ask(client: "Client") -> None:
 
 
 def watch_over(executor: Executor) -> Watch | None:
-    """Return a watch over the scheduler of an executor's workers; None for other kinds
-    of executors."""
+    """Return a watch for the scheduler of a dask executor. Return None for other
+    executors."""
     module = sys.modules.get("distributed.cfexecutor")
     if module is None or not isinstance(executor, module.ClientExecutor):
         return None
-    client = executor._client  # dask has no public name for the client
+    client = executor._client  # dask has no public name for this attribute
     if client.scheduler is None:
         return None
     return Watch(client)
 
 
 def completed(futures: Collection[Future[T]], watch: Watch | None) -> Iterator[Future[T]]:
-    """Yield futures in the order in which they end; raise SchedulerError if the
-    scheduler drops them or is silent."""
+    """Yield futures in the order in which they end. Raise SchedulerError if the
+    scheduler drops them or does not answer."""
     waiting = set(futures)
     timeout = None
     if watch is not None:

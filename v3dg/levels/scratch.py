@@ -1,4 +1,4 @@
-"""Scratch folders: files of rows that are removed when the work is done."""
+"""Scratch folders with files of rows. They are removed when the work is done."""
 
 import os
 from collections.abc import Collection, Iterator
@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from v3dg import _files
 
-_MARK = "v3dg-scratch"  # a file that marks the folder as created here
+# the name of a file that marks the folder as created by this module
+_MARK = "v3dg-scratch"
 
 _Scalar = TypeVar("_Scalar", np.float32, np.uint32)
 
@@ -52,7 +53,7 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
             yield self.read(start, min(start + size, last))
 
     def write(self, first: int, rows: npt.NDArray[_Scalar]) -> None:
-        """Write rows from row `first` on."""
+        """Write rows, beginning at row `first`."""
         data = np.ascontiguousarray(rows, self._dtype).reshape(-1).view(np.uint8).data
         with _files.naming_errors(self.path):
             _files.write_at(self._descriptor, data, first * self._row_bytes)
@@ -60,9 +61,9 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
 
 @contextmanager
 def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
-    """Create an empty folder for files with these names, and remove it at the end.
+    """Create an empty folder for files with these names. Remove it at the end.
 
-    Files with these names that a killed run has left are removed.
+    First, remove files with these names that a killed run has left.
     """
     folder.mkdir(mode=0o700, exist_ok=True)
     with _files.locked_folder(folder, folder):
@@ -76,8 +77,8 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
                 f"{folder}: expected scratch files of a build, got another file, "
                 f"{foreign_names[0]!a}; move it elsewhere"
             )
-        # The mark is the first file to be created and the last to be removed: in a
-        # folder without a mark, no file is from a build.
+        # The mark is created before, and removed after, all other files. So a folder
+        # without a mark has no files of a build.
         os.close(
             os.open(
                 folder / _MARK,

@@ -1,4 +1,4 @@
-"""Makes the levels above the leaves, for a whole asset or for a subtree."""
+"""Makes the levels above the leaves, for a whole asset or a subtree."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +15,8 @@ from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.plan import LevelPlan, Offsets, Plan
 from v3dg.levels.rows import in_runs
 
-# Number of groups that are initialised together. Ctrl-C has to wait for them, about a
-# second.
+# Number of groups that are initialised together. This takes about a second, during
+# which Ctrl-C has no effect.
 _GROUPS_AT_ONCE = 256
 
 Show = Callable[[range, int, int, _core.FitProgress], None]
@@ -29,11 +29,11 @@ class LevelTables:
     bundle follow from the plan."""
 
     box: npt.NDArray[np.float32]  # (C, 2, 3), boxes around the drawn clusters
-    # (G, 4) balls for the selection. Each ball contains those of the groups below.
+    # (G, 4) balls for selection; each contains the balls of the groups below
     ball: npt.NDArray[np.float32]
     # (G, 4) smallest balls around groups, which the views of the fit show
     fit_ball: npt.NDArray[np.float32]
-    # (G, 2) remaining errors of the fits: colour and alpha.
+    # (G, 2) remaining errors of the fits: colour and alpha
     error: npt.NDArray[np.float32]
 
 
@@ -50,9 +50,9 @@ class LevelBuilder:
     """Makes the levels of a plan for a whole asset or for any subtree of it.
 
     The result for a group depends only on the leaves under it, the config, the seed,
-    its level and its index in the level. So on the CPU the same groups get the same
-    bits in every plan. On CUDA, the number of groups that are fitted together can
-    change how a group is spread over the GPU, and thereby the last bits.
+    its level, and its index in the level. Therefore, on the CPU, a group has the same
+    bits in every plan. On CUDA, the number of groups that are fitted together decides
+    how many blocks fit a group, which can change the last bits.
     """
 
     plan: Plan
@@ -67,7 +67,7 @@ class LevelBuilder:
         show: Show = lambda levels, num_groups, num_gaussians, state: None,
     ) -> Iterator[Level]:
         """Yield all levels in ascending order, beginning with the leaves as level 0.
-        `finished` are levels from level 1 on that need not be built again."""
+        `finished` has levels above 0 that need not be built again."""
         plan = self.plan.levels[0]
         leaves = in_runs(self.codec.rounded(leaves, plan.offset), plan.offset)
         ball = _device.to_host(_core.bound_spheres(_spheres(leaves), plan.leaf_offset))
@@ -85,9 +85,9 @@ class LevelBuilder:
     def levels_above(
         self, lower_levels: dict[int, Level], finished: Iterable[Level], show: Show
     ) -> Iterator[Level]:
-        """Yield the levels above `lower_levels`, a dict of levels by number. Its
-        content changes: new levels are added, and those that no later level is fitted
-        to are removed."""
+        """Yield the levels above `lower_levels`, which maps numbers to levels. New
+        levels are added to it, and levels are removed when no later level is fitted to
+        them."""
         saved = iter(finished)
         num_levels = len(self.plan.levels)
         last = max(lower_levels)
@@ -103,7 +103,8 @@ class LevelBuilder:
             first_needed = min(last, self.config.target_of(last + 1))
             for number in [number for number in lower_levels if number < first_needed]:
                 del lower_levels[number]
-            while levels:  # do not keep yielded levels alive
+            # The caller, and not this function, decides how long a level is kept.
+            while levels:
                 yield levels.pop(0)
 
     def _simplify(
@@ -149,8 +150,8 @@ class LevelBuilder:
         return levels
 
     def _starts(self, gaussians: Gaussians, numbers: range) -> Gaussians:
-        """Return the initial gaussians of the groups of some levels, each level halved
-        from the one below it."""
+        """Return the initial gaussians of the groups of some levels. Each level is made
+        by halving the one below."""
         starts: list[Gaussians] = []
         for number in numbers:
             plan = self.plan.levels[number]
@@ -162,14 +163,18 @@ class LevelBuilder:
 
 
 def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
-    """Return (G,) seeds of random numbers, different for every group of the asset."""
+    """Return (G,) seeds of random numbers, which differ between all groups of the
+    asset."""
     return (number << 40) + np.arange(
         plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64
     )
 
 
 def _joined(parts: Sequence[Gaussians]) -> Gaussians:
-    """Return the gaussians of all parts, without a copy if there is only one part."""
+    """Return the gaussians of all parts.
+
+    If there is only one part, it is not copied.
+    """
     if len(parts) == 1:
         return parts[0]
     return Gaussians.concatenate(parts)
@@ -183,7 +188,7 @@ def _level(
     fit_ball: npt.NDArray[np.float32],
     error: npt.NDArray[np.float32],
 ) -> Level:
-    """Return a level of fitted groups, each split into its clusters."""
+    """Return a level of fitted groups, each of which is split into its clusters."""
     clusters_made = plan.num_clusters // plan.num_groups
     if clusters_made > 1:
         order, _ = _core.median_split(
@@ -198,7 +203,7 @@ def _level(
 def _view(
     target: Level, plan: Plan, number: int, config: BuildConfig
 ) -> tuple[Offsets, npt.NDArray[np.float32]]:
-    """Return what the groups of a level are fitted to: (G + 1,) offsets of the target's
+    """Return the target of each group of a level: (G + 1,) offsets of the target's
     gaussians, and (G, 4) balls that the views show."""
     source = config.target_of(number)
     leaf_offset = plan.levels[number].leaf_offset
@@ -227,11 +232,11 @@ def _spheres(gaussians: Gaussians) -> Array:
 def _target(
     lower_levels: Mapping[int, Level], numbers: range, config: BuildConfig
 ) -> _core.FitTarget:
-    """Return the gaussians that groups are fitted to, with the appearance that they
-    have when they are selected.
+    """Return the gaussians that groups are fitted to. Their appearance is the one with
+    which they are drawn.
 
-    The asset's own filter is left out. It widens gaussians without reducing their
-    opacity, most of all at small sizes, so coarser levels would become too thick.
+    The asset's own filter is omitted. It widens gaussians without reducing their
+    opacity, most of all at small sizes, so coarser levels would become too opaque.
     """
     rows = _joined([lower_levels[number].gaussians for number in numbers]).rows
     if numbers[0] == 0:
@@ -242,8 +247,8 @@ def _target(
 def _start(
     gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig
 ) -> Gaussians:
-    """Return the initial gaussians of groups: those at `offset`, reduced to as many as
-    `out_offset` has room for."""
+    """Return the initial gaussians of groups. The gaussians at `offset` are reduced to
+    the numbers that `out_offset` allows."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
     result = empty(int(out_offset[-1]), gaussians.sh_degree)
@@ -268,8 +273,9 @@ def _halved(
 
 
 def _ranges(offsets: Sequence[Offsets], counts: Sequence[int] | Offsets) -> npt.NDArray[np.int64]:
-    """Return (S, 2) start and end of S segments in concatenated arrays. `offsets` has
-    the boundaries of the segments in each array, and `counts` the arrays' lengths."""
+    """Return (S, 2) start and end of S segments after the arrays are concatenated.
+    `offsets` has the boundaries of the segments in each array, and `counts` the lengths
+    of the arrays."""
     first = np.cumsum([0, *counts])
     moved = [offset + start for offset, start in zip(offsets, first[:-1], strict=True)]
     return np.concatenate([np.stack([offset[:-1], offset[1:]], axis=1) for offset in moved])

@@ -1,6 +1,6 @@
-"""Measures whether an asset needs the filter of coarser levels. A smooth one does not,
-because its gaussians are about as wide as the distances between them; a faint one loses
-alpha by it."""
+"""Measures whether the coarser levels of an asset need a filter. The gaussians of a
+smooth asset are about as wide as the distances between them, so it needs none. A faint
+asset would lose alpha with a filter."""
 
 from dataclasses import replace
 
@@ -15,26 +15,26 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.plan import Plan
 from v3dg.levels.simplify import LevelBuilder
 
-# Opacities below this are faint: with the opacity that compensates for a filter, much
-# of such a gaussian is below the least alpha that is drawn, 1/255.
+# Opacities below this are faint. A filter reduces the opacity of such gaussians, so
+# that much of them falls below 1/255, the smallest alpha that is drawn.
 _FAINT_OPACITY = 0.1
 # Number of groups of level 1 that are fitted twice: with a filter of this variance, and
 # without a filter.
 _GROUPS = 32
 _FILTER_PX2 = 0.05
-# Maximum number of leaves in a group that is fitted twice; fitting larger groups would
-# take too long.
+# Maximum number of leaves of a group that is fitted twice, because fitting larger
+# groups would take too long.
 _MOST_LEAVES = 1 << 15
-# An asset needs the filter if its loss without the filter is larger by this factor
-# (docs/levels.md).
+# An asset needs the filter if its loss without the filter is at least this many times
+# as large (docs/levels.md).
 _NEEDED = 1.4
 
 
 def measured_config(
     config: BuildConfig, plan: Plan, leaves: Leaves, seed: int, codec: Codec, device: Device
 ) -> BuildConfig:
-    """Return the config that levels are built with: "measured" becomes "yes" if the
-    asset is smooth; a faint asset has no filter."""
+    """Return the config for building the levels. "measured" becomes "yes" if the asset
+    is smooth, and a faint asset gets no filter."""
     smooth = replace(config, smooth="yes", filter_px2=0.0)
     if config.smooth == "yes":
         return smooth
@@ -52,7 +52,7 @@ def measured_config(
     if _is_faint(sample):
         return replace(config, filter_px2=0.0)
     # The sample consists of the groups that were read. Each is divided into two
-    # clusters, for any group size of the build.
+    # clusters, whatever the group size of the build.
     sample_config = replace(
         config,
         init="merge",
@@ -74,7 +74,10 @@ def measured_config(
 
 
 def _is_faint(gaussians: Gaussians) -> bool:
-    """Whether faint gaussians have most of the area, weighted by opacity."""
+    """Return whether most of the area belongs to faint gaussians.
+
+    The area is weighted by opacity.
+    """
     host = gaussians.numpy()
     scales = np.sort(host.scales.astype(np.float64), axis=1)
     weight = scales[:, 1] * scales[:, 2] * host.opacities

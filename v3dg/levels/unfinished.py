@@ -197,7 +197,7 @@ class Unfinished:
         while _files.read_at(descriptor, head, self._end):
             part, number, digest = _RECORD.unpack(head.tobytes())
             if not (part < len(self._parts) and number in self._parts[part]):
-                raise ValueError("a level is damaged")
+                raise ValueError("a finished level is damaged")
             plan, run = self._parts[part][number]
             tables = LevelTables(
                 box=np.empty((plan.num_clusters, 2, 3), np.float32),
@@ -213,7 +213,7 @@ class Unfinished:
                     return
                 end += array.nbytes
             if page_hash(arrays) != digest:
-                raise ValueError("a level is damaged")
+                raise ValueError("a finished level is damaged")
             level = FinishedLevel(tables, hashes)
             level.read(self.pages, run)  # checks the hashes of the pages
             self.levels[part, number] = level
@@ -264,8 +264,9 @@ class Unfinished:
             bundle = Bundle.open(self._path)
             if self._bundle_path is None:
                 return refine(bundle, None)
-            refine(bundle, units_folder(self._path)).write(self._bundle_path)
-            discard_units(self._path)
+            with locked_units(units_folder(self._path)) as folder:
+                refine(bundle, folder).write(self._bundle_path)
+                discard_units(self._path)
             self._path.unlink()
         elif self._bundle_path is not None:
             _files.put_in_place(self._path, self._bundle_path)
@@ -312,6 +313,28 @@ def units_folder(levels_path: str | os.PathLike[str]) -> Path:
     """Return the folder for refined units of the bundle, or of the unfinished levels,
     at a path."""
     return Path(levels_path).with_suffix(".units")
+
+
+@contextmanager
+def locked_units(folder: Path) -> Iterator[Path]:
+    """Create a folder for refined units, and lock it against other refinements. At the
+    end it is removed if it is empty."""
+    while True:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        created = os.lstat(folder)
+        with _files.locked_folder(folder, folder, "refinement"):
+            # The process that held the lock before may have removed the folder. In this
+            # case another one is created.
+            is_there = False
+            with suppress(FileNotFoundError):
+                is_there = os.path.samestat(created, os.lstat(folder))
+            if is_there:
+                try:
+                    yield folder
+                finally:
+                    with suppress(OSError):
+                        folder.rmdir()
+                return
 
 
 def discard_units(levels_path: str | os.PathLike[str]) -> None:

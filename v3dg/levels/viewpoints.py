@@ -1,10 +1,11 @@
 """Cameras of a refinement, found without photographs: around an object, at eyes inside
 a place, or both.
 
-A camera outside of a room would look at its walls from behind, which nobody sees; and
-one inside of an object would look at nothing. So the places that a subject surrounds
-(`v3dg.framing`) decide. A house in a garden has such places and is seen from both
-sides: then much that is seen from outside stands far from all places inside.
+A camera outside a room would only show its walls from behind, and a camera inside a
+solid object would show nothing. So the free places that a subject surrounds
+(`v3dg.framing`) decide. A house in a garden has such places, but is also seen from
+outside. It is recognised because much of what is seen from outside is far from all
+places inside.
 """
 
 import math
@@ -23,43 +24,44 @@ from v3dg.framing import surroundings
 from v3dg.upright import direction_of, up_of
 
 SeenFrom = Literal["auto", "outside", "inside", "both"]
-"""From where a subject is seen; "auto" finds out."""
+"""Where a subject is seen from; "auto" detects it."""
 
 RECORDED = ("eyes", "outside", "units")
-"""The names in the record of a refinement that follow from the gaussians: those that
-`Viewpoints.record` has, and the number of units."""
+"""Names of entries in the config that depend on the gaussians: those of
+`Viewpoints.record`, and the number of units."""
 
 _NUM_EYES = 96
-# Cameras at an eye, a quarter turn apart, alternately up and down by this angle, with
-# this field of view: together they see all but a cone at the poles.
+# The cameras at an eye are a quarter turn apart, and look up and down in turn by this
+# angle. With this field of view, they together show all directions except a cone at
+# each pole.
 _CAMERAS_PER_EYE = 4
 _PITCH = math.radians(15)
 _FIELD = math.radians(90)
-# The angle between the cameras of one eye and those of the next: the golden one, so
-# that no direction repeats.
+# The angle between the cameras of successive eyes. It is the golden angle, so that no
+# direction repeats.
 _TURN = math.pi * (3 - math.sqrt(5))
-# Only the shape of the picture counts.
+# Only the aspect ratio of the picture matters.
 _PIXELS = 512
-# The distance of cameras around a subject from its centre, in radii; the ball with this
-# share of the gaussians fills their pictures.
+# The distance of cameras around a subject from its centre, in radii. The pictures show
+# a ball with this fraction of the gaussians.
 _DISTANCE = 2.5
 _SHARE = 0.99
-# The nearest depth that is drawn, in radii.
+# The near depth, in radii.
 _NEAR = 0.002
-# The share of what is seen from outside of a surrounding subject that is not its walls,
-# above which it is seen from outside, too.
+# For a subject with places inside: the fraction of what is seen from outside that is
+# not its walls. Above this value, it counts as seen from outside, too.
 _LEAST_OUTER = 0.08
-# A camera is used for a part of a subject if it sees at least this share of the
-# gaussians of the part.
+# A camera is used for a part of a subject if it sees at least this fraction of the
+# part's gaussians.
 _LEAST_SEEN = 0.05
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """From where pictures of a refinement are taken.
+    """Where the pictures of a refinement are taken from.
 
     Attributes:
-        cameras: The cameras; none for pictures from all around.
+        cameras: The cameras; empty for pictures from all directions.
         num_eyes: The number of eyes inside.
     """
 
@@ -68,7 +70,10 @@ class Viewpoints:
 
     @property
     def record(self) -> JsonObject:
-        """What the config of a bundle says; empty for pictures from all around."""
+        """Return the entries for the config of a bundle.
+
+        Pictures from all directions have none.
+        """
         if self.num_eyes == 0:
             return {}
         is_outside_too = len(self.cameras) > self.num_eyes * _CAMERAS_PER_EYE
@@ -76,12 +81,15 @@ class Viewpoints:
 
     @property
     def text(self) -> str:
-        """What a user reads; empty for pictures from all around."""
+        """Return a description for users.
+
+        It is empty for pictures from all directions.
+        """
         return text_of(self.record)
 
 
 def text_of(record: JsonObject) -> str:
-    """Return what a user reads of the record of a refinement."""
+    """Return the description of a refinement from its entries in a config."""
     if "eyes" not in record:
         return ""
     if record["outside"]:
@@ -93,8 +101,8 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
     """Return the viewpoints of a bundle.
 
     Raises:
-        ValueError: `seen_from` is unknown; or it is "inside" or "both", and no place is
-            found inside.
+        ValueError: `seen_from` is not a valid value, or it is "inside" or "both" and
+            there is no place inside.
     """
     one_of(seen_from, "seen_from", get_args(SeenFrom))
     if seen_from == "outside":
@@ -127,8 +135,8 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
 
 
 def cameras_that_see(bundle: Bundle, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """Return the cameras with at least `_LEAST_SEEN` of a bundle's leaves in their
-    pictures; all of them if there are none."""
+    """Return the cameras that see at least the fraction `_LEAST_SEEN` of a bundle's
+    leaves, or all cameras if none does."""
     leaves = bundle.level_range(0)
     middle = np.asarray(bundle.clusters.box[leaves.start : leaves.stop], np.float64).mean(axis=1)
     weight = np.diff(bundle.clusters.offset)[leaves.start : leaves.stop]
@@ -141,8 +149,8 @@ def cameras_that_see(bundle: Bundle, cameras: Sequence[Camera]) -> tuple[Camera,
 
 
 def _is_in_picture(camera: Camera, points: Floats) -> npt.NDArray[np.bool_]:
-    """Return (N,) whether each point is in front of a camera and in its picture,
-    without the distortion of its lens."""
+    """Return (N,) whether each point is in front of a camera and inside its picture.
+    Lens distortion is ignored."""
     x, y, depth = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
     depth = np.where(depth > camera.near, depth, np.nan)
     column = camera.fx * x / depth + camera.cx
@@ -160,8 +168,8 @@ def _ball(bundle: Bundle) -> tuple[Floats, float]:
 
 
 def _spread(places: Floats) -> Floats:
-    """Return at most `_NUM_EYES` of the places, each the farthest from those before
-    it, from the one in the middle on."""
+    """Return at most `_NUM_EYES` of the places. The first is the one in the middle;
+    each of the others is the farthest from those before it."""
     middle = places.mean(axis=0)
     number = int(np.square(places - middle).sum(axis=1).argmin())
     numbers = [number]
@@ -200,7 +208,7 @@ def _cameras_at(eye: Floats, up: Floats, azimuth: float, radius: float) -> list[
 
 
 def _cameras_around(middle: Floats, radius: float, count: int) -> list[Camera]:
-    """Return cameras that see all of a ball from evenly spread directions."""
+    """Return cameras in evenly spread directions, each of which sees a whole ball."""
     field = 2 * math.atan(1 / math.sqrt(_DISTANCE**2 - 1))
     cameras = []
     for number in range(count):

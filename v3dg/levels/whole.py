@@ -1,4 +1,4 @@
-"""Builds a whole asset: threads or an executor build its units, then this process
+"""Builds a whole asset. Threads or an executor build its units, then this process
 builds the levels above them."""
 
 import os
@@ -46,22 +46,22 @@ from v3dg.levels.unfinished import (
 )
 from v3dg.levels.viewpoints import SeenFrom
 
-# Number of leaves in a unit: enough to keep a GPU busy, with little memory. The last
-# bits of a bundle depend on this number.
+# Number of leaves in a unit. It is large enough to keep a GPU busy, but needs little
+# memory. The last bits of a bundle depend on this number.
 UNIT_LEAVES = 1 << 20
 # Factor by which the balls of level 1 grow if a smooth asset is too large to be
 # measured. Level 1 is then selected at half the size (docs/levels.md).
 _UNMEASURED = 2.0
-# Number of units that a GPU processes at once, so that the GPU is not idle while a unit
-# builds its smallest levels.
+# Number of units that a GPU processes at once. While one unit builds its smallest
+# levels, the others keep the GPU busy.
 _UNITS_ON_GPU = 4
 
 _Levels = dict[int, FinishedLevel]
 
 
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
-    """Return the devices of a build. For "auto" and "cuda": the asset's or the current
-    device, and all others of its kind."""
+    """Return the devices of a build. "auto" and "cuda" mean the asset's device or the
+    current one, together with all others of its kind."""
     first = _device.resolve(device)
     if not first.is_cuda or str(device) not in ("auto", "cuda"):
         return [first]
@@ -136,7 +136,7 @@ def _opened(
 
 
 def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
-    """Return the part of each unit and, last, the part of the levels above all
+    """Return the parts: the units, followed by the part with the levels above all
     units."""
 
     def runs(number: int, count: int) -> list[PageRun]:
@@ -193,8 +193,8 @@ class _Build:
         if runs:
             first = self.config.target_of(self.num_low)
         lower_levels: dict[int, Level] = {}
-        # The levels above the units are fitted to these levels of the units, and start
-        # from them.
+        # The levels above the units start from these levels of the units, and are
+        # fitted to them.
         for n in range(first, self.num_low):
             gaussians = _device.place(self._level(n).gaussians, devices[0])
             lower_levels[n] = Level(gaussians, finished[n].tables)
@@ -211,8 +211,8 @@ class _Build:
         return tables, np.concatenate([level.hashes for level in finished])
 
     def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
-        """Return the tables with larger balls; the growth of level 1 is measured if the
-        asset is one unit."""
+        """Return the tables with larger balls. If the asset is a single unit, the
+        growth of level 1 is measured."""
         ball = tables[1].ball
         level_1 = self.plan.levels[1]
         growth = np.full(len(ball), _UNMEASURED, np.float32)
@@ -269,7 +269,8 @@ class _Build:
 
         def submit(unit: int) -> Future[_Levels]:
             task = self._task(unit, leaves)
-            if isinstance(leaves, MemoryLeaves):  # the leaves of the unit are sent with the task
+            # a task for another process contains the leaves of its unit
+            if isinstance(leaves, MemoryLeaves):
                 task = replace(task, leaves=task.leaves().numpy)
             return executor.submit(build_in_worker, task, expected_device, nonce)
 
@@ -291,8 +292,8 @@ class _Build:
     def _collect(
         self, submit: Callable[[int], Future[_Levels]], watch: Watch | None = None
     ) -> None:
-        """Build units, and save their levels; a failure or an interrupt ends the other
-        units."""
+        """Build the units, and save their levels. After a failure or an interrupt, stop
+        the other units."""
         units: dict[Future[_Levels], int] = {}
         try:
             for unit in self._todo:
@@ -332,8 +333,8 @@ class _Build:
 
 @dataclass(frozen=True, eq=False)
 class UnitTask:
-    """Everything that the work on a unit needs. It can be pickled if its `leaves` and
-    `pages` can."""
+    """Everything that is needed to build a unit. It can be pickled if its `leaves` and
+    `pages` can be."""
 
     leaves: Callable[[], Gaussians]
     builder: LevelBuilder
@@ -360,7 +361,8 @@ class UnitTask:
 
 
 class WorkerDevice(NamedTuple):
-    """The device that every worker must have, so that all give the same bits."""
+    """The device that every worker must have, so that all workers give the same
+    bits."""
 
     kind: str  # "cpu" or "cuda"
     description: str
@@ -371,10 +373,11 @@ class WorkerDevice(NamedTuple):
 
 
 def build_in_worker(task: UnitTask, expected_device: WorkerDevice, _: bytes) -> _Levels:
-    """Build a unit in a worker of an executor, on a device that must be as expected.
+    """Build a unit in a worker of an executor. Raise an error if the worker's device is
+    not the expected one.
 
-    The last argument differs in each build, because dask returns a cached result for
-    the same arguments.
+    The last argument differs in each build. Otherwise dask would return a cached result
+    for the same arguments.
     """
     device = _device.resolve(expected_device.kind)
     worker = f"worker on {socket.gethostname()}"

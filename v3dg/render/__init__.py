@@ -1,7 +1,7 @@
 """Draw scenes, bundles and assets: select a cut, then project, bin and blend it.
 
-`api.py` has `v3dg.render`, `renderer.py` has `v3dg.Renderer`. Both draw with a frame:
-of an asset (`asset_frame.py`), of a scene whose gaussians are all resident
+`api.py` has `v3dg.render`, and `renderer.py` has `v3dg.Renderer`. Both draw with a
+frame: of an asset (`asset_frame.py`), of a scene whose gaussians are all resident
 (`scene_frame.py`), or of a pool (`pool_frame.py`). `frame.py` defines the interface of
 frames and chooses one. `request.py` defines the requests.
 """

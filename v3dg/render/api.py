@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, cast, get_args, overload
 
-from v3dg import _device
+from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import check, one_of, vector, whole
 from v3dg.camera_batch import CameraBatch
-from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera, for_each
+from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
@@ -19,12 +21,11 @@ from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.batch import BatchRequest, are_alike
-from v3dg.render.frame import FrameSource, frame_of
-from v3dg.render.picture import Picture
+from v3dg.render.frame import Frame, FrameSource, frame_of
 from v3dg.render.rays import RayImage, check_rays, draw_rays
 from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.render.scene_frame import SceneFrame
-from v3dg.render.sensor import Channel, MeshLayer, sensor_of
+from v3dg.render.sensor import Channel, Meshes, MeshLayer, layers_of, sensor_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
@@ -48,7 +49,7 @@ class _Options(CutOptions, total=False):
     min_transmittance: float | None
     depth: bool
     channels: Sequence[Channel]
-    mesh: MeshLayer | None
+    mesh: Meshes | None
     device: str | Device
     color_by: ColorBy
     memory: int | str | None
@@ -84,109 +85,157 @@ def render(
     min_transmittance: float | None = None,
     depth: bool = False,
     channels: Sequence[Channel] = (),
-    mesh: MeshLayer | None = None,
+    mesh: Meshes | None = None,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
 ) -> RayImage | _Pictures:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
-    Level 0 is drawn with the asset's own filter, coarser levels with the filter that
-    they were made for (V3DG, section 3.4; docs/levels.md defines the metric). An asset
-    is drawn completely and without a filter. An asset that was trained with
-    antialiasing (`Gaussians.antialiased`) is drawn as in training: with a filter of 0.3
+    Level 0 is drawn with the asset's own filter, and coarser levels with the filter
+    that they were fitted for (V3DG, section 3.4; docs/levels.md defines the metric). An
+    asset is drawn completely and without a filter. An asset that was trained with
+    antialiasing (`Gaussians.antialiased`) is drawn as in training, with a filter of 0.3
     px² and compensated opacities.
 
     Args:
-        subject: What to draw, in world space; or its file, which every call opens
-            again.
-        camera: Camera of any model. With several, each has its own cut and its own
-            picture, as if drawn alone; pinholes of one size and one near plane are
-            drawn at once, unless there is a budget, a cut or a pool (docs/sensors.md).
-            The two eyes of a stereo camera share one cut and one frame. Their two
-            pictures have common statistics, which are sums, except for the number of
-            selected gaussians. None means the first camera of a scene's file, else the
-            camera of `first_camera`. An `EquirectangularCamera` is drawn with all
-            gaussians resident, without statistics, and takes none of `budget`, `cut`,
-            `min_transmittance`, `mesh`, channels other than "depth", and a number of
-            bytes as `memory`.
+        subject: What to draw, in world space. If it is the path of a file, every call
+            opens the file again.
+        camera: Camera of any model, or several cameras. Each of several cameras has its
+            own cut and its own picture, as if it were drawn alone. Pinhole cameras of
+            one size and one near plane are drawn at once, unless there is a budget, a
+            cut or a pool (docs/sensors.md). The two eyes of a stereo camera share one
+            cut and one frame. Their two pictures have common statistics, which are
+            sums, except for the number of selected gaussians. None means the first
+            camera of a scene's file, else the camera of `first_camera`. For an
+            `EquirectangularCamera`, all gaussians must be resident, and there are no
+            statistics. It does not support `budget`, `cut`, `min_transmittance`,
+            `mesh`, channels other than "depth", or a number of bytes as `memory`.
         tolerance, budget, min_level: As in `v3dg.select`.
-        fade: As in `v3dg.select`; the weight of a cluster multiplies its opacities. Use
+        fade: As in `v3dg.select`. The weight of a cluster multiplies its opacities. Use
             `v3dg.DEFAULT_FADE` for films.
-        cut: A cut that was selected earlier from this scene, which is drawn for any
-            camera, so that it can be inspected from all sides. Replaces `tolerance`,
+        cut: A cut that was selected earlier from this scene. It is drawn for any
+            camera, so that it can be inspected from all sides. It replaces `tolerance`,
             `budget`, `min_level` and `fade`.
-        color_by: "level" or "cluster" colours gaussians by their level or cluster,
+        color_by: "level" or "cluster" colours gaussians by their level or cluster;
             "residency" shows where pages are missing.
-        background: Three numbers: the colour behind all gaussians.
-        min_transmittance: A pixel stops behind the gaussian that leaves this
-            transmittance or less, 0 to 0.99, and distributes the rest over the
-            gaussians that it has blended. So the error of a channel is at most this
-            fraction of the difference to the colour behind that gaussian. None means,
-            for scenes and bundles, 0.0001 up to a tolerance of 3 px², then more, up to
-            0.001 from 9.5 px² on, where levels differ by more; with a budget, by the
-            tolerance that meets it. Assets are then drawn as by `v3dg.rasterize`.
+        background: The colour behind all gaussians, as three numbers.
+        min_transmittance: A pixel stops when its transmittance is at most this value, 0
+            to 0.99; the remaining light is distributed over the gaussians that were
+            blended. So the error of a channel is at most this fraction of the
+            difference to the colour behind the last gaussian. None depends on the
+            subject. For scenes and bundles, it means 0.0001 up to a tolerance of 3 px²,
+            and then a value that grows to 0.001 at 9.5 px², because the errors of
+            coarser levels are larger. With a budget, the tolerance that meets the
+            budget counts. Assets are drawn as by `v3dg.rasterize`.
         depth: Whether to draw the expected depth, too.
-        channels: Names of channels that are drawn beside colour and alpha, and become
+        channels: Names of channels to draw in addition to colour and alpha. They become
             attributes of the picture: "depth" (as `depth=True`), "median_depth",
             "normal", "instance", "label", "weight", "clipped" (docs/sensors.md).
-            "clipped" is drawn only on the CPU, and needs a pinhole.
-        mesh: Picture of meshes of the same size, for one camera. Its pixels hide the
-            gaussians behind them. Colour, alpha and channels include gaussians and
-            meshes.
-        device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
-            torch tensors there on torch's current stream, and keeps on the device what
-            the next picture of the same scene or bundle needs; a `Renderer` controls
-            how long. "auto" means "cuda" if it works.
-        memory: As in `Renderer`; each picture waits for all pages that it needs.
+            "clipped" needs a pinhole camera.
+        mesh: A picture of meshes, of the same size. Its pixels hide the gaussians
+            behind them. Colour, alpha and channels include gaussians and meshes. For
+            several cameras, pass a list with a layer for each of them, or one layer
+            with planes (B, H, W). For a stereo camera, pass two layers, or one layer
+            with planes (2, H, W).
+        device: "cpu" draws NumPy arrays. "cuda", or a specific device such as "cuda:1",
+            draws torch tensors on that device, on torch's current stream. What the next
+            picture of the same scene or bundle needs stays on the device; use a
+            `Renderer` to control how long. "auto" means "cuda" if it works, otherwise
+            "cpu". "webgpu" draws NumPy arrays on a GPU of any maker, only for pinhole
+            cameras, and only colour and alpha (docs/webgpu.md).
+        memory: As in `Renderer`. Each picture waits for all pages that it needs.
 
     Raises:
         ValueError: An argument is invalid, or the coarsest cut has more gaussians than
-            the budget; on CUDA the latter is raised when the picture is used.
-        RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
+            the budget. On CUDA, the latter is raised when the picture is used.
+        RuntimeError: `device` is "cuda" or "webgpu", and something that it needs is
+            missing.
+        ImportError: `device` is "webgpu", and the package wgpu is missing.
     """
     opened_subject, camera = _with_camera(subject, camera)
     cut_request = CutRequest(tolerance, budget, min_level, fade)
     if isinstance(camera, EquirectangularCamera):
-        with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=_device.CPU)
+        with_depth, sensor = sensor_of(channels, mesh, depth=depth, device=_device.CPU)
         check_rays(color_by, cut, sensor, min_transmittance, memory)
         return draw_rays(opened_subject, camera, cut_request, background, device, depth=with_depth)
-    chosen_device = _device.resolve(device)
+    chosen_device = _device.resolve_for_drawing(device)
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     is_asset = isinstance(opened_subject, Gaussians)
-    with_depth, sensor = sensor_of(channels, mesh, camera, depth=depth, device=chosen_device)
+    with_depth, _ = sensor_of(channels, None, depth=depth)
     shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
+    look = _Look(cut_request, shade, cut, channels, chosen_device)
+    chosen_frame = frame.chosen(opened_subject)
+    if isinstance(camera, Iterable):
+        return _draw_several(chosen_frame, opened_subject, list(camera), mesh, look)
+    check_camera(camera)
+    return chosen_frame.draw_settled(opened_subject, look.picture(camera, mesh))
 
-    def picture(view: Camera | StereoCamera) -> Picture:
-        check_camera(view)
-        request = FrameRequest(view, cut_request, shade, cut, sensor=sensor)
-        return frame.chosen(opened_subject).draw_settled(opened_subject, request)
 
-    if isinstance(camera, list | tuple) and cut is None and budget is None and are_alike(camera):
-        scene_frame = frame.chosen(opened_subject)
-        if isinstance(scene_frame, SceneFrame):
-            at_once = BatchRequest(CameraBatch.of(camera), cut_request, shade, None, sensor)
-            return _pictures_at_once(scene_frame, opened_subject, camera, at_once)
-    return cast(_Pictures, for_each(camera, picture))
+@dataclass(frozen=True)
+class _Look:
+    """The requests for pictures that differ only in their cameras and their meshes."""
+
+    cut: CutRequest
+    shade: _core.Shade
+    selection: Selection | None
+    channels: Sequence[Channel]
+    device: Device
+
+    def picture(self, camera: Camera | StereoCamera, mesh: Meshes | None) -> FrameRequest:
+        sensor = self._sensor(mesh)
+        return FrameRequest(camera, self.cut, self.shade, self.selection, sensor=sensor)
+
+    def batch(self, cameras: Sequence[Camera], layers: Sequence[MeshLayer]) -> BatchRequest:
+        """Return the request for a batch; without layers, it has no meshes."""
+        sensor = self._sensor(layers or None)
+        return BatchRequest(CameraBatch.of(cameras), self.cut, self.shade, None, sensor)
+
+    def _sensor(self, mesh: Meshes | None) -> _core.Sensor | None:
+        return sensor_of(self.channels, mesh, depth=False, device=self.device)[1]
+
+
+def _draw_several(
+    frame: Frame,
+    subject: Subject,
+    cameras: Sequence[Camera | StereoCamera],
+    mesh: Meshes | None,
+    look: _Look,
+) -> _Pictures:
+    """Return the picture of each camera. All of them are checked before the first one
+    is drawn."""
+    for camera in cameras:
+        check_camera(camera)
+    layers = layers_of(mesh, cameras)
+    is_free = look.selection is None and look.cut.budget is None
+    if is_free and isinstance(frame, SceneFrame) and are_alike(cameras):
+        return _pictures_at_once(frame, subject, cast("Sequence[Camera]", cameras), layers, look)
+    meshes: Sequence[MeshLayer | None] = layers or [None] * len(cameras)
+    requests = [look.picture(*pair) for pair in zip(cameras, meshes, strict=True)]
+    return cast("_Pictures", [frame.draw_settled(subject, request) for request in requests])
 
 
 def _pictures_at_once(
     frame: SceneFrame,
     subject: Subject,
     cameras: Sequence[Camera],
-    request: BatchRequest,
+    layers: Sequence[MeshLayer],
+    look: _Look,
 ) -> list[RenderedImage]:
-    """Return pictures that are drawn as batches: all by one call on a CUDA device; on
-    the CPU a few at a time, so that the program can be interrupted."""
+    """Return pictures that are drawn as batches. A CUDA device draws all of them in one
+    call. The CPU draws a few at a time, so that the program can be interrupted."""
     first = cameras[0]
     size = len(cameras)
     if not frame.device.is_cuda:
         size = max(1, _MOST_PIXELS_A_CALL // (first.width * first.height))
+    requests = [
+        look.batch(cameras[begin : begin + size], layers[begin : begin + size])
+        for begin in range(0, len(cameras), size)
+    ]
     pictures: list[RenderedImage] = []
-    for begin in range(0, len(cameras), size):
-        part = CameraBatch.of(cameras[begin : begin + size])
-        batch = frame.draw_batch(subject, request._replace(cameras=part))
-        pictures += [batch[number] for number in range(len(part))]
+    for request in requests:
+        batch = frame.draw_batch(subject, request)
+        pictures += [batch[number] for number in range(len(request.cameras))]
     return pictures
 
 
@@ -198,8 +247,8 @@ def first_camera(
     up: Axis | VectorLike | None = None,
 ) -> Camera:
     """Return the default camera for a subject, which the viewer and `v3dg render` also
-    use. It shows all of an object, from its front and a little above. A room is shown
-    from its middle.
+    use. It shows an object completely, from its front and slightly above. It shows a
+    room from its middle.
 
     The field of view across the shorter side is 45 degrees, and 65 degrees inside a
     room.
@@ -207,7 +256,7 @@ def first_camera(
     Args:
         subject: A scene, a bundle, an asset, or the path of a file with one of them.
         width, height: Size of the picture in px.
-        up: The axis or direction that is up; None uses the axis of
+        up: The axis or direction that points up. None uses the axis of
             `v3dg.upright.up_of`.
 
     Raises:
@@ -227,15 +276,18 @@ def first_camera(
 
 
 def _with_camera(subject: Subject | File, camera: _Camera | None) -> tuple[Subject, _Camera]:
-    """Return an opened subject and the camera, or its default camera for None."""
+    """Return an opened subject and a camera.
+
+    If the camera is None, it is the default camera.
+    """
     if camera is None:
         return _with_first_camera(subject)
     return opened(subject), camera
 
 
 def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
-    """Return a subject and its default camera: the first camera in its file, else that
-    of `first_camera`."""
+    """Return a subject and its default camera: the first camera in its file, else the
+    camera of `first_camera`."""
     if not isinstance(subject, str | os.PathLike):
         return subject, first_camera(subject)
     path = Path(subject)
@@ -252,7 +304,7 @@ def _still_frame(
     bundle is stored with the subject.
 
     Frames that differ only in `color_by` share a pool. If the size of the pool is
-    given, only the last pool is kept.
+    given, only the most recent pool is kept.
     """
     one_of(color_by, "color_by", get_args(ColorBy))
     if isinstance(subject, Gaussians):

@@ -1,4 +1,7 @@
-"""The frame of an asset. An asset has no levels and no pages, so all of it is drawn."""
+"""The frame of an asset.
+
+An asset has no levels and no pages, so it is drawn completely.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +24,8 @@ if TYPE_CHECKING:
 
 
 class AssetFrame:
-    """Draws one asset on one device, where it keeps the asset's arrays. An asset that
-    was trained with antialiasing is drawn as it was trained.
+    """Draws one asset on one device. It keeps the asset's arrays on that device. An
+    asset that was trained with antialiasing is drawn as in training.
 
     Attributes:
         device: The device that draws.
@@ -54,13 +57,16 @@ class AssetFrame:
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw the asset; raise ValueError if the request needs levels."""
+        """Draw the asset. Raise ValueError if the request needs levels."""
         is_selected = request.selection is None
         check("cut", is_selected, "no cut for an asset, which has no levels, got one; leave it out")
         check_request(request.cut)
         camera = request.camera
         if isinstance(camera, StereoCamera):
-            left, right = (self._draw_eye(eye, request, stop) for eye in camera.eyes)
+            left, right = (
+                self._draw_eye(eye, request.of_eye(number), stop)
+                for number, eye in enumerate(camera.eyes)
+            )
             return left, right
         return self._draw_eye(camera, request, stop)
 
@@ -69,7 +75,7 @@ class AssetFrame:
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
-        """Return at once, because all of an asset is resident."""
+        """Return immediately, because an asset is always resident."""
 
     def _draw_eye(
         self, camera: Camera, request: FrameRequest, stop: _core.Stop | None
@@ -85,8 +91,8 @@ class AssetFrame:
 
 
 def check_request(request: CutRequest) -> None:
-    """Raise ValueError for a request that needs levels; a tolerance and a fade are
-    accepted without effect."""
+    """Raise ValueError for a request that needs levels. A tolerance and a fade are
+    accepted, but have no effect."""
     if request.is_plain:
         _check_known(*request)
     else:

@@ -1,4 +1,4 @@
-"""Batches: pictures of one size for many cameras, drawn by one call."""
+"""Batches: pictures of one size for many cameras, drawn in one call."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from v3dg import _core
 from v3dg._device import Device
 from v3dg._numbers import Floats, check, check_type
 from v3dg.camera_batch import CameraBatch, form_of
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, StereoCamera
 from v3dg.image import ChannelPlanes, Planes, RenderedImage, Sensed, Stats
 from v3dg.render.request import CutRequest
 
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class BatchPlanes:
-    """The memory of a batch's pictures: contiguous and float32 (ids int32), NumPy
-    arrays or torch tensors on the device that draws.
+    """The memory for a batch's pictures. The arrays are contiguous and float32 (int32
+    for ids). They are NumPy arrays, or torch tensors on the device that draws.
 
     Attributes:
         color: (B, H, W, 3) premultiplied colour with the background, or (B, H, W, 4)
-            with coverage as the fourth channel.
-        alpha: (B, H, W) coverage; None if it is not wanted, or is in `color`.
-        depth: (B, H, W) expected depth along the camera's axis, 0 where nothing was
+            with alpha as the fourth channel.
+        alpha: (B, H, W) opacity. None if it is not wanted, or is in `color`.
+        depth: (B, H, W) expected depth along the camera's axis, 0 where nothing is
             drawn; None if it is not wanted.
-        median_depth, weight: (B, H, W) channels (docs/sensors.md), which are drawn if
-            there are planes for them; None if they are not wanted.
-        normal: (B, H, W, 3), likewise.
-        instance, label: (B, H, W) int32, likewise.
+        median_depth, weight: (B, H, W) channels (docs/sensors.md). None for each that
+            is not wanted.
+        normal: (B, H, W, 3), or None.
+        instance, label: (B, H, W) int32, or None.
     """
 
     color: Array
@@ -53,8 +53,8 @@ class BatchPlanes:
 
     @cached_property
     def core(self) -> _core.BatchPlanes:
-        """The planes for the compiled operations; ValueError if they do not fit
-        together."""
+        """The planes for the compiled operations. Raises ValueError if their sizes or
+        devices do not match."""
         return _core.BatchPlanes(
             self.color,
             self.alpha,
@@ -68,15 +68,16 @@ class BatchPlanes:
 
 
 class BatchStats(NamedTuple):
-    """Costs of a batch; see `Stats`.
+    """The costs of drawing a batch; see `Stats`.
 
     Attributes:
         gaussians_selected: (B,) int64.
         gaussians_in_frustum: (B,) int64.
-        tolerance: In px²; the same for all cameras.
-        select_ms, draw_ms: On the CPU summed over the cameras; on CUDA 0 while a graph
+        tolerance: In px², the same for all cameras.
+        select_ms, draw_ms: On the CPU, sums over the cameras. On CUDA, 0 while a graph
             is captured.
-        num_parts: In how many parts the batch was drawn, because of the memory.
+        num_parts: The number of parts in which the batch was drawn, which depends on
+            the memory.
     """
 
     gaussians_selected: NDArray[np.int64]
@@ -90,7 +91,8 @@ class BatchStats(NamedTuple):
 class RenderedBatch(Sensed):
     """B pictures of H x W pixels.
 
-    CUDA may still be drawing them; reading an attribute waits for the end.
+    CUDA may still be drawing the pictures. Reading an attribute waits until they are
+    finished.
     """
 
     def __init__(self, core: _core.Batch, cameras: CameraBatch, tolerance: float) -> None:
@@ -101,8 +103,8 @@ class RenderedBatch(Sensed):
 
     @property
     def planes(self) -> BatchPlanes:
-        """The arrays of the attributes without waiting, for work that is queued on the
-        same stream."""
+        """The arrays of the attributes, without waiting. Use them for work that is
+        queued on the same stream."""
         channels = self._core.channels
         return BatchPlanes(
             self._core.color,
@@ -117,19 +119,19 @@ class RenderedBatch(Sensed):
 
     def wait(self) -> None:
         """Wait until all pictures are drawn. If the buffers of the renderer were too
-        small, this draws the batch again, as reading an attribute does."""
+        small, draw the batch again. Reading an attribute does the same."""
         self._core.finish()
 
     @property
     def color(self) -> Array:
-        """(B, H, W, 3) premultiplied colour, the background composed last; (B, H, W, 4)
-        in planes that have alpha as the fourth channel."""
+        """(B, H, W, 3) premultiplied colour with the background; (B, H, W, 4) if the
+        planes have alpha as the fourth channel."""
         self._core.finish()
         return self._core.color
 
     @property
     def alpha(self) -> Array:
-        """(B, H, W) coverage."""
+        """(B, H, W) opacity."""
         self._core.finish()
         return self._alpha
 
@@ -144,7 +146,7 @@ class RenderedBatch(Sensed):
 
     @property
     def depth(self) -> Array:
-        """(B, H, W) expected depth along the axes of the cameras, 0 where nothing was
+        """(B, H, W) expected depth along the axes of the cameras, 0 where nothing is
         drawn."""
         self._core.finish()
         depth = self._core.depth
@@ -157,8 +159,8 @@ class RenderedBatch(Sensed):
     @property
     def distance(self) -> Array:
         """(B, H, W) expected distance from the eye along the ray through each pixel's
-        centre, 0 where nothing was drawn. Computed from the depth, with the K that the
-        cameras have now."""
+        centre, 0 where nothing is drawn. It is computed from the depth, with the
+        current K of the cameras."""
         depth = self.depth
         if isinstance(depth, np.ndarray):
             return np.where(depth > 0, depth * ray_lengths(self._cameras), 0).astype(np.float32)
@@ -191,7 +193,7 @@ class RenderedBatch(Sensed):
         return self._stats
 
     def picture_planes(self, number: int) -> Planes:
-        """Return the planes of one picture, once it is drawn."""
+        """Return the planes of one picture. Waits until it is drawn."""
         self._core.finish()
         depth = self._core.depth
         if depth is not None:
@@ -200,7 +202,7 @@ class RenderedBatch(Sensed):
         return Planes(color, self._alpha[number], depth, _channels_of(self._channels, number))
 
     def picture_stats(self, number: int) -> Stats:
-        """Return the costs of one picture; on CUDA, times are those of the whole
+        """Return the costs of one picture. On CUDA, the times are those of the whole
         batch."""
         stats = self._core_stats()
         levels: tuple[int, ...] = ()
@@ -265,7 +267,7 @@ class _PictureOfBatch(RenderedImage):
 
 
 class BatchRequest(NamedTuple):
-    """The request for a batch; new planes are made if there are none."""
+    """Return the request for a batch. Without planes, new ones are created."""
 
     cameras: CameraBatch
     cut: CutRequest
@@ -277,7 +279,7 @@ class BatchRequest(NamedTuple):
 def draw_batch(
     frame: _core.SceneFrame, resident: ResidentScene, device: Device, request: BatchRequest
 ) -> RenderedBatch:
-    """Draw a batch of a resident scene with the gaussians of a frame."""
+    """Draw a batch of a scene whose gaussians are all resident."""
     cameras = request.cameras
     planes = None
     if request.planes is not None:
@@ -292,9 +294,10 @@ def draw_batch(
 
 
 def ray_lengths(cameras: CameraBatch, depth: Array | None = None) -> Array:
-    """Return (B, H, W) or (1, H, W) lengths of the vectors from the eyes through the
-    centres of pixels to depth 1, in double precision: on the host, or as a tensor where
-    `depth` is. The depth of a fisheye is a length already."""
+    """Return the distances from the eyes to depth 1 along the rays through the centres
+    of pixels, (B, H, W) or (1, H, W), in double precision. The result is an array on
+    the host, or a tensor on the device of `depth`. For a fisheye camera, it is 1,
+    because its depth is already a distance."""
     if cameras.lenses is not None:
         return np.stack([_ray_lengths_of_lens(camera) for camera in cameras.lenses])
     K: Array = cameras.K
@@ -304,7 +307,7 @@ def ray_lengths(cameras: CameraBatch, depth: Array | None = None) -> Array:
         import torch
 
         if isinstance(K, np.ndarray):
-            K = np.array(K)  # a copy, because torch warns of arrays that are read-only
+            K = np.array(K)  # a copy, because torch warns about read-only arrays
         K, columns, rows = (
             torch.as_tensor(array, dtype=torch.float64, device=depth.device)
             for array in (K, columns, rows)
@@ -316,7 +319,7 @@ def ray_lengths(cameras: CameraBatch, depth: Array | None = None) -> Array:
 
 
 def _ray_lengths_of_lens(camera: Camera) -> Floats:
-    """Return (H, W); 0 where a lens shows nothing."""
+    """Return (H, W) distances; 0 outside the image circle of a lens."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     directions = camera.directions(np.column_stack([columns.ravel(), rows.ravel()]))
     lengths = np.nan_to_num(np.linalg.norm(directions, axis=1))
@@ -324,19 +327,18 @@ def _ray_lengths_of_lens(camera: Camera) -> Floats:
 
 
 def check_planes(planes: BatchPlanes | None, *, with_depth: bool) -> None:
-    """Raise TypeError unless planes are `BatchPlanes`, and ValueError if they lack the
-    depth that was asked for."""
+    """Raise TypeError if planes are not `BatchPlanes`. Raise ValueError if the depth
+    was requested and they have no plane for it."""
     if planes is None:
         return
     check_type("out", planes, BatchPlanes, "a BatchPlanes")
     check("out", planes.depth is not None or not with_depth, "planes with depth, got none")
 
 
-def are_alike(cameras: Sequence[Camera]) -> bool:
-    """Return whether cameras can be drawn as one batch: two or more pinholes of one
-    size and one near plane."""
-    if len(cameras) < 2 or any(type(camera) is not Camera for camera in cameras):
+def are_alike(cameras: Sequence[Camera | StereoCamera]) -> bool:
+    """Return whether cameras can be drawn as one batch. There must be at least two
+    pinhole cameras of one size and one near plane."""
+    pinholes = [camera for camera in cameras if type(camera) is Camera and not camera.is_distorted]
+    if len(cameras) < 2 or len(pinholes) < len(cameras):
         return False
-    if any(camera.is_distorted for camera in cameras):
-        return False
-    return len({form_of(camera) for camera in cameras}) == 1
+    return len({form_of(camera) for camera in pinholes}) == 1

@@ -1,5 +1,5 @@
-"""Frames: the buffers for pictures of one subject on one device, and the choice of a
-frame for a subject."""
+"""Frames: the buffers for pictures of one subject on one device. Also chooses the frame
+for a subject."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from v3dg.render.picture import Picture
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.request import CutRequest, FrameRequest
 from v3dg.render.scene_frame import SceneFrame
+from v3dg.render.webgpu.frame import WebGpuFrame, check_subject
 from v3dg.residency import ResidentScene, residency
 
 if TYPE_CHECKING:
@@ -37,15 +38,15 @@ class Frame(Protocol):
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw what is resident; for a stereo camera, one picture per eye.
+        """Draw what is resident. For a stereo camera, draw one picture per eye.
 
         Args:
-            steps: Pacing state of a sequence of pictures; None for a single one.
-            stop: Ends a picture early on the CPU.
+            steps: Pacing state of a sequence of pictures; None for a single picture.
+            stop: On the CPU, ends a picture early.
         """
 
     def draw_settled(self, subject: Subject, request: FrameRequest) -> Picture:
-        """Draw a picture that misses no page, regardless of what other threads draw."""
+        """Draw a picture in which no page is missing, whatever other threads draw."""
 
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
@@ -54,24 +55,24 @@ class Frame(Protocol):
 
 
 class FrameSource(Protocol):
-    """Provides the frame of a subject on one device. The frame can change when the
-    subject grows."""
+    """Provides the frame for drawing a subject on one device. The frame can change when
+    the subject grows."""
 
     device: Device
 
     @property
     def memory(self) -> int | None:
-        """Size of the frame's pool in bytes; None if everything is resident."""
+        """The size of the frame's pool in bytes; None if everything is resident."""
 
     def chosen(self, subject: Subject) -> Frame:
         """Return the frame that currently draws the subject."""
 
 
 class AutoFrame:
-    """Draws with all gaussians resident if they fit, else from a pool.
+    """Draws with all gaussians resident if they fit, and otherwise from a pool.
 
-    The choice is made on construction, and again when bundles are added; a pool is
-    never given up.
+    The choice is made on construction, and again when bundles are added. A pool is
+    kept, even if everything would fit later.
 
     Attributes:
         device: The device that draws.
@@ -122,12 +123,15 @@ def frame_of(
 
     Args:
         memory: Bytes of a pool; "auto" and None as in `v3dg.Renderer`.
-        slot: Where the frame stores its pool, if it has one.
+        slot: Where the frame stores its pool if it has one.
 
     Raises:
         ValueError: `color_by` or `memory` is invalid; see `v3dg.Renderer`.
     """
     one_of(color_by, "color_by", get_args(ColorBy))
+    if device.is_webgpu:
+        check_subject(subject, color_by, memory)
+        return WebGpuFrame()
     if isinstance(subject, Gaussians):
         is_without = memory is None or memory == "auto"
         check(

@@ -9,14 +9,14 @@ from v3dg import _core
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.image import RenderedImage, Stats
 
-# One picture for a camera; for a stereo camera one per eye, left first.
+# One picture for a camera. For a stereo camera, one picture per eye, left first.
 Picture: TypeAlias = RenderedImage | tuple[RenderedImage, RenderedImage]
 
 
 def picture_of(
     drawing: _core.Drawing, camera: Camera | StereoCamera, finish: Callable[[], Stats]
 ) -> Picture:
-    """Return the picture of a drawing; `finish` waits for the picture and returns its
+    """Return the picture of a drawing. `finish` waits for the picture and returns its
     statistics."""
     left = RenderedImage(drawing, finish)
     if isinstance(camera, Camera):

@@ -1,5 +1,5 @@
-"""The frame of a pool. Only those gaussians of a scene are resident that views need and
-that fit into the pool."""
+"""The frame of a pool. Of a scene's gaussians, only those are resident that views need
+and that fit into the pool."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _STILL_TIMEOUT_SECONDS = 30.0
 class PoolFrame:
     """Draws a scene or a bundle on one device from a pool.
 
-    It does not keep the subject alive.
+    The frame does not keep the subject alive.
 
     Attributes:
         device: The device that draws.
@@ -48,7 +48,7 @@ class PoolFrame:
         self._core = _core.SceneFrame(device.number)
         self._pool: Pool | None = None
         self._references: tuple[weakref.ref[Bundle], ...] | None = None
-        self._resident: ResidentScene | None = None  # the scene as it was last drawn
+        self._resident: ResidentScene | None = None  # the scene as of the last picture
         self._has_settled = False  # whether `settle` was called after the last picture
 
     @property
@@ -60,13 +60,14 @@ class PoolFrame:
     def take(self, resident: ResidentScene) -> Pool:
         """Return the pool of the scene's bundles."""
         pool = self._pool
-        if pool is not None and self._references is resident.references:  # true for most pictures
+        # the usual case
+        if pool is not None and self._references is resident.references:
             return pool
         with residency.lock:
             bundles = resident.bundles
             tables = [residency.table(bundle) for bundle in bundles]
-            # Drop both references, because the new pool may need the memory of the old
-            # one.
+            # Drop both references to the old pool, because the new pool may need its
+            # memory.
             pool = None
             self._pool = None
             pool = self._slot.pool(bundles, tables, self.device, self._num_bytes)
@@ -85,7 +86,7 @@ class PoolFrame:
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw the resident part of a cut, after bringing in pages that are ready."""
+        """Bring in pages that are ready, then draw the resident part of a cut."""
         _refuse_given_cut(request)
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
@@ -95,15 +96,15 @@ class PoolFrame:
         if not self.device.is_cuda:
             _finish(picture)
         elif self._has_settled:
-            # If buffers were too small, the picture is drawn again. Finishing it now
-            # ensures that the pages brought in by `settle` are still resident then.
+            # If buffers were too small, finishing the picture draws it again. Finish it
+            # now, while the pages that `settle` brought in are still resident.
             _finish(picture)
         self._has_settled = False
         return picture
 
     def draw_settled(self, subject: Subject, request: FrameRequest) -> Picture:
-        """Settle and draw in one step, in which no other thread's view uses the
-        pool."""
+        """Settle and draw in one step. Views of other threads cannot use the pool in
+        between."""
         _refuse_given_cut(request)
         camera = request.camera.core
         while True:
@@ -114,7 +115,8 @@ class PoolFrame:
             with pool.lease:
                 pool.settle(resident, camera, request.cut.rule, _STILL_TIMEOUT_SECONDS, math.inf)
                 with residency.turn(self.device):
-                    if resident.revision != revision:  # another thread has changed the scene
+                    # another thread has changed the scene
+                    if resident.revision != revision:
                         continue
                     picture = self._enqueue(resident, pool, request, None, None)
                 _finish(picture)
@@ -128,7 +130,7 @@ class PoolFrame:
         timeout: float = _STILL_TIMEOUT_SECONDS,
         seconds: float = math.inf,
     ) -> None:
-        """Bring in the pages that a view needs, or those of them that arrive within
+        """Bring in the pages that a view needs, or as many of them as arrive within
         `seconds`. The errors are those of `Pool.settle`."""
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = cut.rule
@@ -140,8 +142,8 @@ class PoolFrame:
         self._has_settled = True
 
     def pick(self, subject: Subject, pixel: _core.Camera, rule: _core.Rule) -> _core.Pick | None:
-        """Return the gaussian with the largest weight in a pixel. Supported only on the
-        CPU."""
+        """Return the gaussian with the largest weight in a pixel. This works only on
+        the CPU."""
         resident = residency.scene(subject, self.device)
         pool = self.take(resident)
         request = _core.FrameRequest(pixel, rule, look=_core.Look(aside=True))
@@ -186,7 +188,7 @@ class PoolFrame:
 
 
 def _finish(picture: Picture) -> None:
-    """Wait for a picture, and raise its error if it has one."""
+    """Wait for a picture, and raise its error if there is one."""
     if isinstance(picture, tuple):
         picture = picture[0]
     picture.stats  # noqa: B018

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class RayImage(Image):
-    """A picture that was drawn with rays.
+    """A picture that was drawn by casting rays.
 
     Attributes:
         gaussians: Number of gaussians in the selected clusters.
@@ -41,8 +41,8 @@ class RayImage(Image):
 
 
 class RayFrame(ResidentFrame):
-    """Casts rays through a scene or a bundle on one device, with buffers that are
-    reused from cast to cast. It does not keep the subject alive."""
+    """Casts rays through a scene or a bundle on one device. The buffers are reused from
+    cast to cast, and the frame does not keep the subject alive."""
 
     def __init__(self, device: Device) -> None:
         super().__init__(device)
@@ -75,7 +75,7 @@ def check_rays(
     min_transmittance: float | None,
     memory: int | str | None,
 ) -> None:
-    """Raise ValueError for options of pictures that rays do not have."""
+    """Raise ValueError for options of `render` that rays do not support."""
     check("cut", cut is None, "none for an equirectangular camera, got one; leave it out")
     check("color_by", color_by == "appearance", f"'appearance' for rays, got {color_by!r}")
     check("channels, mesh", sensor is None, "none but 'depth' for rays, got others; leave them out")
@@ -95,16 +95,16 @@ def cast_rays(
     environments: Array | None = None,
     returns: tuple[float, float] | None = None,
 ) -> _core.Cast:
-    """Cast the rays of a sensor through the cut of a scene or a bundle, or through all
-    of an asset, at each of B poses.
+    """Cast the rays of a sensor at each of B poses, through the cut of a scene or a
+    bundle, or through all gaussians of an asset.
 
     Args:
-        viewmats: (B, 4, 4) world to sensor: doubles in host memory, or a tensor of
-            float32 or float64 on the device.
-        environments: (B,) int32 or, on a CUDA device, int64, where the poses are; None
+        viewmats: (B, 4, 4) from world to sensor, as doubles in host memory, or as a
+            float32 or float64 tensor on the device.
+        environments: (B,) int32 or, on a CUDA device, int64, where the poses are. None
             for sensors that see all instances.
-        returns: The least weight of a return, and the gap behind it; None for colour
-            and range.
+        returns: The minimum weight of a return, and the gap after it; None to compute
+            colour and range instead.
 
     Raises:
         ValueError: The cut has a budget, an asset has a cut or environments, or an
@@ -155,9 +155,14 @@ def draw_rays(
     *,
     depth: bool,
 ) -> RayImage:
-    """Draw an equirectangular picture; its depth is the mean distance along the ray, by
-    blend weight."""
+    """Draw an equirectangular picture. Its depth is the mean distance along the ray,
+    weighted by blend weights."""
     back_color = color_of(background, "background")
+    if str(device) == "webgpu":
+        raise ValueError(
+            "camera: expected a pinhole with device='webgpu', got an EquirectangularCamera; use "
+            "'cpu' or 'cuda'"
+        )
     chosen_device = _device.resolve(device)
     cast = cast_rays(subject, camera.core, camera.sensor_viewmat[None], cut, chosen_device)
     color = cast.color[0]

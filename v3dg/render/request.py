@@ -1,5 +1,5 @@
-"""Requests: the cut of a picture and what its pixels show, as values that pass from the
-API to the core."""
+"""Requests: what to draw, as values that are passed from the public functions to the
+core. A request has the cut of a picture and what its pixels show."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class CutRequest(NamedTuple):
 
     @property
     def is_plain(self) -> bool:
-        """Whether all values are Python's own numbers. Only then can results be cached
-        with the values as keys."""
+        """Whether all values are Python's own numbers. Only then may they be used as
+        keys of a cache."""
         return _PLAIN_TYPES.issuperset(map(type, self))
 
     @property
@@ -57,24 +57,24 @@ def _rule(
     return rule_of(tolerance, budget, min_level, fade=fade)
 
 
-# Consecutive pictures mostly have equal requests. The cache distinguishes types,
+# Consecutive pictures usually have equal requests. The cache distinguishes types,
 # because True equals 1 but must be rejected.
 _known_rule = lru_cache(64, typed=True)(_rule)
 
 
 @dataclass(frozen=True)
 class Look:
-    """The colours that a picture drawn from a pool shows, and the choice of its cut.
-    Colours other than "appearance" work only on the CPU.
+    """The colours of a picture, and the choice of its cut. With a pool on a GPU, only
+    the colours "appearance" are allowed.
 
     Attributes:
-        shows: Colours as in `v3dg.render`; "error" shows metrics as fractions of the
-            tolerance, in grey; "count" replaces depth by the number of gaussians that a
+        shows: Colours as in `v3dg.render`. "error" shows metrics as fractions of the
+            tolerance, in grey. "count" replaces depth by the number of gaussians that a
             pixel blends.
-        chooser: The camera that the cut is selected for; None for the camera of the
+        chooser: The camera that the cut is selected for. None means the camera of the
             picture.
         aside: Whether to draw only the pages that were resident for the last picture,
-            without bringing pages in or requesting any.
+            without bringing in or requesting any.
     """
 
     shows: ColorBy | Literal["error", "count"] = "appearance"
@@ -84,7 +84,7 @@ class Look:
     @property
     def is_plain(self) -> bool:
         """Whether the picture has the gaussians' own colours, a cut for its own camera,
-        and pages as usual."""
+        and normal use of pages."""
         return self.shows == "appearance" and self.chooser is None and not self.aside
 
     def core(self, bundles: Sequence[Bundle]) -> _core.Look | None:
@@ -98,8 +98,8 @@ class Look:
         return _core.Look(self.shows, self.palettes(bundles), chooser, self.aside)
 
     def palettes(self, bundles: Sequence[Bundle]) -> list[NDArray[np.float32]]:
-        """Return the colours of each bundle's clusters; empty if gaussians have their
-        own colours."""
+        """Return the colours of each bundle's clusters. They are empty if the gaussians
+        keep their own colours."""
         if self.shows not in ("level", "cluster"):
             return []
         palettes = []
@@ -114,12 +114,12 @@ class FrameRequest(NamedTuple):
     """The request for one picture.
 
     Attributes:
-        camera: The camera of the picture; the two eyes of a stereo camera share a cut.
+        camera: The camera of the picture. The two eyes of a stereo camera share a cut.
         cut: The cut to select.
         shade: The background, and the transmittance at which pixels stop.
         selection: A cut that was selected earlier, which is drawn instead of `cut`.
-        look: What the picture shows; None for the frame's own colours.
-        sensor: Channels beside colour, and meshes; None for neither.
+        look: What the picture shows. None means the frame's own colours.
+        sensor: Channels other than colour, and meshes; None for neither.
     """
 
     camera: Camera | StereoCamera
@@ -129,6 +129,12 @@ class FrameRequest(NamedTuple):
     look: Look | None = None
     sensor: _core.Sensor | None = None
 
+    def of_eye(self, number: int) -> FrameRequest:
+        """Return the request of a stereo camera with the meshes of one eye."""
+        if self.sensor is None:
+            return self
+        return self._replace(sensor=self.sensor.of_eye(number))
+
 
 def shade_of(
     background: Sequence[float], min_transmittance: float | None, *, is_asset: bool, depth: bool
@@ -136,8 +142,8 @@ def shade_of(
     """Return the shade of a picture for the core; the arguments are those of
     `v3dg.render`.
 
-    By default pixels of assets stop as in `v3dg.rasterize`, and those of cuts by the
-    tolerance of the cut.
+    By default, pixels of assets stop as in `v3dg.rasterize`. Pixels of cuts stop at a
+    transmittance that depends on the tolerance of the cut.
     """
     if background is BLACK and min_transmittance is None:
         return _known_shade(is_asset=is_asset, depth=bool(depth))
@@ -163,6 +169,6 @@ def _shade(
 
 @lru_cache(4)
 def _known_shade(*, is_asset: bool, depth: bool) -> _core.Shade:
-    """Return the shade of a picture with default arguments, which most pictures
-    have."""
+    """Return the shade of a picture with default arguments. Most pictures have
+    these."""
     return _shade(BLACK, None, is_asset=is_asset, depth=depth)

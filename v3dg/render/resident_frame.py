@@ -1,4 +1,4 @@
-"""What the frames have in common that draw a scene whose gaussians are all resident."""
+"""The common part of all frames that draw a scene with all gaussians resident."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 
 class ResidentFrame(ABC):
-    """The bundles of a scene on one device. It does not keep the subject alive.
+    """The bundles of a scene on one device. The frame does not keep the subject alive.
 
     Attributes:
         device: The device that draws.
-        num_bundles: Number of the scene's bundles whose gaussians are on the device. A
-            scene never removes bundles.
+        num_bundles: Number of the scene's bundles whose gaussians are on the device. It
+            never decreases, because a scene never removes bundles.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self.num_bundles = 0
         self._references: tuple[weakref.ref[Bundle], ...] | None = None
-        self._resident: ResidentScene | None = None  # the scene as it was last drawn
+        self._resident: ResidentScene | None = None  # the scene as of the last picture
 
     @abstractmethod
     def _set_models(self, bundles: Sequence[Bundle]) -> None:
@@ -37,7 +37,7 @@ class ResidentFrame(ABC):
 
     def take(self, resident: ResidentScene) -> None:
         """Put the gaussians of the scene's bundles on the device."""
-        if self._references is resident.references:  # true for most pictures
+        if self._references is resident.references:  # the usual case
             return
         with residency.lock:
             bundles = resident.bundles
@@ -47,7 +47,10 @@ class ResidentFrame(ABC):
             self._references = resident.references
 
     def _taken(self, subject: Subject) -> ResidentScene:
-        """Return the scene as it is now, after taking it."""
+        """Copy the bundles of the scene to the device.
+
+        Return the scene in its current state.
+        """
         resident = residency.scene(subject, self.device, self._resident)
         self._resident = resident
         self.take(resident)

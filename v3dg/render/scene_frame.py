@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 
 class SceneFrame(ResidentFrame):
-    """Draws a scene or a bundle on one device, where all its gaussians are resident.
+    """Draws a scene or a bundle on one device, with all gaussians resident.
 
-    It does not keep the subject alive.
+    The frame does not keep the subject alive.
 
     Attributes:
         memory: None, because this frame has no pool.
@@ -60,7 +60,8 @@ class SceneFrame(ResidentFrame):
         if selection is not None:
             if isinstance(camera, StereoCamera):
                 left, right = (
-                    self._draw_given(subject, request, selection, eye, stop) for eye in camera.eyes
+                    self._draw_given(subject, request.of_eye(number), selection, eye, stop)
+                    for number, eye in enumerate(camera.eyes)
                 )
                 return left, right
             return self._draw_given(subject, request, selection, camera, stop)
@@ -94,7 +95,7 @@ class SceneFrame(ResidentFrame):
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
-        """Return at once, because everything is resident."""
+        """Return immediately, because everything is resident."""
 
     def _draw_given(
         self,
@@ -107,7 +108,7 @@ class SceneFrame(ResidentFrame):
         """Draw a cut that was selected earlier."""
         with residency.turn(self.device):
             resident = self._taken(subject)
-            _check_cut(cut, subject, resident, request.cut)
+            check_cut(cut, subject, resident, request.cut)
             weights = None
             if cut.given_weights is not None:
                 weights = self._on_device(cut.given_weights)
@@ -136,11 +137,11 @@ class SceneFrame(ResidentFrame):
         return torch.tensor(values, device=str(self.device))
 
 
-def _check_cut(
+def check_cut(
     cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest
 ) -> None:
-    """Raise ValueError for a cut that was not selected from the current scene, and for
-    other arguments that contradict the cut."""
+    """Raise ValueError if a cut was not selected from the current scene, or if other
+    arguments contradict the cut."""
     check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in request._asdict().items():
         check(name, not value, f"no value together with a cut, got {value}; leave it out")

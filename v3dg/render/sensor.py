@@ -1,17 +1,18 @@
-"""Channels of pictures beside colour, and layers of meshes that are combined with
+"""Channels of pictures other than colour, and layers of meshes that are combined with
 gaussians. docs/sensors.md defines them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
 from v3dg import _core
 from v3dg._device import CPU, Device
 from v3dg._numbers import MOST_FLOAT, check, check_type, one_of
+from v3dg.cameras import Camera, StereoCamera
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,11 +26,15 @@ if TYPE_CHECKING:
 Channel: TypeAlias = Literal[
     "depth", "median_depth", "normal", "instance", "label", "weight", "clipped"
 ]
-"""A channel that is drawn beside colour and alpha."""
+"""A channel that is drawn in addition to colour and alpha."""
+
+Meshes: TypeAlias = "MeshLayer | Sequence[MeshLayer]"
+"""The meshes of one picture, or of several."""
 
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 MESH = -2
-"""The value of the channel `instance` if a mesh without ids has the largest weight."""
+"""The value of the channel `instance` where a mesh without ids has the largest
+weight."""
 
 
 class _Planes(NamedTuple):
@@ -45,29 +50,31 @@ class _Planes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeshLayer:
-    """A picture of meshes with its z-buffer, from any renderer, for the same camera.
+    """A picture of meshes with its z-buffer, for the same camera. Any renderer may have
+    drawn it.
 
     Gaussians behind the meshes are hidden, and those in front are blended over them.
-    The planes are (H, W) for one camera, or (B, H, W) for a batch. They are arrays, or
-    torch tensors. If the depth is a tensor on a CUDA device, all planes must be tensors
-    there. They are read when the picture is drawn on that device, without copies to the
-    host and without checks of their values: where the depth is not positive and finite,
-    or the coverage is NaN, there is no mesh. Other planes are checked on the host.
+    The planes are (H, W) for one camera, (2, H, W) for the eyes of a stereo camera, or
+    (B, H, W) for a list or a batch of cameras. They are arrays or torch tensors. If the
+    depth is a tensor on a CUDA device, all planes must be tensors on that device. They
+    are read when the picture is drawn, without copies to the host. Their values are not
+    checked; where the depth is not positive and finite, or the coverage is NaN, there
+    is no mesh. All other planes are checked on the host.
 
     Attributes:
-        color: (..., 3) colour of the meshes, 1 for white, not multiplied by coverage.
-            Divide 8-bit colours by 255.
+        color: (..., 3) colour of the meshes, not multiplied by coverage: floats, 1 for
+            white, or uint8, 255 for white.
         depth: (...) depth of the meshes along the camera's axis, in world units. A
-            gaussian is in front if the depth of its centre is smaller.
+            gaussian is in front if its mean has a smaller depth.
         coverage: (...) fraction of the pixel that meshes cover, 0 to 1. None means 1
-            where the depth is positive and finite, else 0.
-        normal: (..., 3) normals in the axes of the camera (x right, y down, z forward),
-            of any length. None means that meshes contribute no normals.
+            where the depth is positive and finite, and 0 elsewhere.
+        normal: (..., 3) normals of any length in the axes of the camera (x right, y
+            down, z forward). None means that meshes contribute no normals.
         instance: (...) whole numbers for the channel `instance`; None means `MESH`.
         label: (...) whole numbers for the channel `label`; None means -1.
-        light: The light of `color`, in which meshes and gaussians are mixed: "display"
-            (sRGB, in which gaussians are trained) or "linear". The resulting picture is
-            in display light in both cases.
+        light: The light in which `color` is stored and is mixed with gaussians:
+            "display" (sRGB, in which gaussians are trained) or "linear". The resulting
+            picture is in display light in both cases.
     """
 
     color: Array
@@ -77,6 +84,52 @@ class MeshLayer:
     instance: Array | None = None
     label: Array | None = None
     light: Literal["display", "linear"] = "display"
+
+    def of_picture(self, number: int) -> MeshLayer:
+        """Return the layer of one of several pictures."""
+
+        def plane(of_all: Array | None) -> Array | None:
+            if of_all is None:
+                return None
+            return of_all[number]
+
+        return MeshLayer(
+            color=self.color[number],
+            depth=self.depth[number],
+            coverage=plane(self.coverage),
+            normal=plane(self.normal),
+            instance=plane(self.instance),
+            label=plane(self.label),
+            light=self.light,
+        )
+
+    @staticmethod
+    def joined(layers: Sequence[MeshLayer]) -> MeshLayer:
+        """Return the layer (B, H, W) of layers (H, W).
+
+        Raises:
+            ValueError: The layers have different planes, sizes or light.
+        """
+        for number, layer in enumerate(layers):
+            expected = f"{layers[0].light!r} as in the first layer, got {layer.light!r}"
+            check(f"mesh[{number}].light", layer.light == layers[0].light, expected)
+
+        def plane(name: str) -> Array | None:
+            return _joined([getattr(layer, name) for layer in layers], name)
+
+        color = plane("color")
+        depth = plane("depth")
+        assert color is not None
+        assert depth is not None
+        return MeshLayer(
+            color=color,
+            depth=depth,
+            coverage=plane("coverage"),
+            normal=plane("normal"),
+            instance=plane("instance"),
+            label=plane("label"),
+            light=layers[0].light,
+        )
 
     def core_on(self, device: Device) -> _core.Mesh:
         """Return the layer for the compiled operations on a device.
@@ -110,7 +163,7 @@ class MeshLayer:
         coverage = self._coverage(depth)
         is_wrong = (coverage > 0) & ~((depth > 0) & (depth <= MOST_FLOAT))
         _refuse_any(depth, is_wrong, "depth", "positive finite depths where there is coverage")
-        color = _numbers(self.color, "color", (*shape, 3))
+        color = _colors(self.color, (*shape, 3))
         _refuse_any(color, ~np.isfinite(color), "color", "finite numbers")
         return _Planes(
             color=color,
@@ -122,12 +175,13 @@ class MeshLayer:
         )
 
     def _planes_there(self, device: Device) -> _Planes:
-        """Return the planes, which are tensors on a device, without waiting for it."""
+        """Return planes that are tensors on a device, without waiting for the
+        device."""
         one_of(self.light, "mesh.light", ("display", "linear"))
         shape = tuple(self.depth.shape)
         check("mesh.depth", len(shape) in (2, 3), f"shape (H, W) or (B, H, W), got {shape}")
         return _Planes(
-            color=_tensor(self.color, "color", (*shape, 3), device, "float32"),
+            color=_color_tensor(self.color, (*shape, 3), device),
             depth=_tensor(self.depth, "depth", shape, device, "float32"),
             coverage=_tensor(self.coverage, "coverage", shape, device, "float32"),
             normal=_tensor(self.normal, "normal", (*shape, 3), device, "float32"),
@@ -151,6 +205,21 @@ class MeshLayer:
         return np.ascontiguousarray(normal / np.where(length > 0, length, 1), np.float32)
 
 
+def _joined(planes: list[Array | None], name: str) -> Array | None:
+    """Return a plane of several layers; None if no layer has it."""
+    for number, plane in enumerate(planes):
+        is_alike = (plane is None) == (planes[0] is None)
+        check(f"mesh[{number}].{name}", is_alike, "a plane in every layer or in none")
+    present = [plane for plane in planes if plane is not None]
+    if not present:
+        return None
+    if all(map(_is_on_cuda, present)):
+        import torch
+
+        return cast("Array", torch.stack(cast("list[torch.Tensor]", present)))
+    return cast("Array", np.stack([_array(plane, name) for plane in present]))
+
+
 def _is_on_cuda(plane: Array) -> bool:
     return bool(getattr(plane, "is_cuda", False))
 
@@ -162,8 +231,9 @@ def _tensor(
     device: Device,
     dtype: Literal["float32", "int32"],
 ) -> torch.Tensor | None:
-    """Return a plane on a device with a type and in one piece; None stays None. Raise
-    ValueError for a plane of another shape, on another device or of another kind."""
+    """Return a plane on a device as a contiguous tensor of a dtype; None stays None.
+    Raise ValueError for a plane of another shape, on another device or of another
+    kind."""
     if plane is None:
         return None
     import torch
@@ -177,6 +247,21 @@ def _tensor(
     fits = is_whole or (dtype == "float32" and tensor.dtype.is_floating_point)
     check(f"mesh.{name}", fits, f"numbers for {dtype}, got {tensor.dtype}")
     return tensor.detach().to(getattr(torch, dtype)).contiguous()
+
+
+_KINDS_OF_COLOR = "floats, 1 for white, or uint8, 255 for white"
+
+
+def _color_tensor(plane: Array, shape: tuple[int, ...], device: Device) -> torch.Tensor | None:
+    """Return colours on a device as float32; see `_tensor`."""
+    import torch
+
+    colors = _tensor(plane, "color", shape, device, "float32")
+    dtype = cast("torch.Tensor", plane).dtype
+    if dtype == torch.uint8:
+        return cast("torch.Tensor", colors) / 255
+    check("mesh.color", dtype.is_floating_point, f"{_KINDS_OF_COLOR}, got {dtype}")
+    return colors
 
 
 def _kind_of(plane: Array) -> str:
@@ -195,7 +280,10 @@ def _on_device(plane: Array | None, device: Device) -> Array | None:
 
 
 def _array(values: Array, name: str) -> HostArray:
-    """Return an array or a tensor as a NumPy array; raise ValueError for others."""
+    """Return an array or a tensor as a NumPy array.
+
+    Raise ValueError for other types.
+    """
     array: HostArray
     try:
         if hasattr(values, "detach"):
@@ -211,7 +299,7 @@ def _array(values: Array, name: str) -> HostArray:
 def _numbers(
     values: Array, name: str, shape: tuple[int, ...] | None = None
 ) -> npt.NDArray[np.float32]:
-    """Return a plane as float32; raise ValueError for NaN or another shape."""
+    """Return a plane as float32. Raise ValueError for NaN or another shape."""
     array = _array(values, name)
     check(f"mesh.{name}", array.dtype.kind in "biuf", f"an array of numbers, got {array.dtype}")
     fits = shape is None or array.shape == shape
@@ -222,8 +310,18 @@ def _numbers(
     return plane
 
 
+def _colors(values: Array, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    """Return colours as float32; raise ValueError for whole numbers that are not
+    8-bit."""
+    array = _array(values, "color")
+    if array.dtype == np.uint8:
+        return np.divide(_numbers(array, "color", shape), 255, dtype=np.float32)
+    check("mesh.color", array.dtype.kind == "f", f"{_KINDS_OF_COLOR}, got {array.dtype}")
+    return _numbers(array, "color", shape)
+
+
 def _ids(values: Array | None, name: str, shape: tuple[int, ...]) -> npt.NDArray[np.int32] | None:
-    """Return a plane of ids as int32; raise ValueError for other kinds and shapes."""
+    """Return a plane of ids as int32. Raise ValueError for other dtypes and shapes."""
     if values is None:
         return None
     array = _array(values, name)
@@ -239,7 +337,7 @@ def _ids(values: Array | None, name: str, shape: tuple[int, ...]) -> npt.NDArray
 def _refuse_any(
     array: npt.NDArray[np.generic], is_wrong: npt.NDArray[np.bool_], name: str, expected: str
 ) -> None:
-    """Raise a ValueError that names the first wrong value and its index."""
+    """Raise a ValueError that has the first wrong value and its index."""
     if not is_wrong.any():
         return
     place = tuple(int(number[0]) for number in np.nonzero(is_wrong))
@@ -247,22 +345,73 @@ def _refuse_any(
     raise ValueError(f"mesh.{name}: expected {expected}, got {array[place]} at [{text}]")
 
 
+def _one_layer(mesh: Meshes) -> MeshLayer:
+    """Return a layer, or several layers as one."""
+    if isinstance(mesh, MeshLayer):
+        return mesh
+    layers = _checked_layers(mesh)
+    check("mesh", layers, "a MeshLayer, or a list of them, got an empty list")
+    return MeshLayer.joined(layers)
+
+
+def layers_of(mesh: Meshes | None, cameras: Sequence[Camera | StereoCamera]) -> list[MeshLayer]:
+    """Return the layer of each of several cameras; empty without meshes.
+
+    Raises:
+        TypeError: `mesh` is neither a `MeshLayer` nor a sequence of them.
+        ValueError: A camera has no layer, or one of another size.
+    """
+    if mesh is None:
+        return []
+    if isinstance(mesh, MeshLayer):
+        shape = np.shape(mesh.depth)
+        expected = f"shape (B, H, W) for a list of cameras, or a list of layers, got {shape}"
+        check("mesh.depth", len(shape) == 3, expected)
+        layers = [mesh.of_picture(number) for number in range(shape[0])]
+    else:
+        layers = _checked_layers(mesh)
+    expected = f"a layer for each of {len(cameras)} cameras, got {len(layers)}"
+    check("mesh", len(layers) == len(cameras), expected)
+    for number, (layer, camera) in enumerate(zip(layers, cameras, strict=True)):
+        shape = tuple(np.shape(layer.depth))
+        size = _size_of(camera)
+        expected = f"shape {size}, as the picture has, got {shape}"
+        check(f"mesh[{number}].depth", shape == size, expected)
+    return layers
+
+
+def _checked_layers(mesh: object) -> list[MeshLayer]:
+    """Return a sequence of layers; raise TypeError for others."""
+    if not isinstance(mesh, list | tuple):
+        check_type("mesh", mesh, MeshLayer, "a MeshLayer, or a list of them")
+    layers = list(cast("Sequence[MeshLayer]", mesh))
+    for number, layer in enumerate(layers):
+        check_type(f"mesh[{number}]", layer, MeshLayer, "a MeshLayer")
+    return layers
+
+
+def _size_of(camera: Camera | StereoCamera) -> tuple[int, ...]:
+    """Return the shape of the planes for the pictures of a camera."""
+    if isinstance(camera, StereoCamera):
+        return (2, camera.left.height, camera.left.width)
+    return (camera.height, camera.width)
+
+
 def sensor_of(
     channels: Sequence[Channel],
-    mesh: MeshLayer | None,
-    cameras: object,
+    mesh: Meshes | None,
     *,
     depth: bool,
     device: Device = CPU,
 ) -> tuple[bool, _core.Sensor | None]:
-    """Return whether depth is drawn, and the request for other channels and meshes, or
-    None without any. The planes of the mesh are brought to a device.
+    """Return whether depth is drawn, and the request for other channels and meshes. The
+    request is None if there are neither. The planes of the mesh are brought to a
+    device. Several layers become one.
 
     Raises:
-        TypeError: `channels` is not a sequence of names, or `mesh` is not a
-            `MeshLayer`.
-        ValueError: A channel is unknown, a plane of the mesh is invalid, or a mesh is
-            given for a list of cameras.
+        TypeError: `channels` is not a sequence of names, or `mesh` is neither a
+            `MeshLayer` nor a sequence of them.
+        ValueError: A channel is unknown, or a plane of the mesh is invalid.
     """
     if isinstance(channels, tuple) and not channels and mesh is None:
         return bool(depth), None  # fast path for most pictures
@@ -273,10 +422,7 @@ def sensor_of(
         one_of(channel, "channels", CHANNELS)
     core_mesh = None
     if mesh is not None:
-        check_type("mesh", mesh, MeshLayer, "a MeshLayer")
-        is_one = not isinstance(cameras, list | tuple)
-        check("mesh", is_one, "one camera, got a list; draw with Renderer.render_batch")
-        core_mesh = mesh.core_on(device)
+        core_mesh = _one_layer(mesh).core_on(device)
     names: list[str] = [channel for channel in channels if channel != "depth"]
     sensor = None
     if names or core_mesh is not None:

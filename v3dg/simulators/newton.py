@@ -49,7 +49,7 @@ def gaussians_of(gaussian: newton.Gaussian) -> Gaussians:
         ValueError: Their colours are in linear light.
     """
     is_display = gaussian.sh_color_space == newton.utils.ColorSpace.SRGB
-    check("gaussian", is_display, "colours in sRGB, in which gaussians are blended, got others")
+    check("gaussian", is_display, "colours in sRGB, got linear ones; load it with colours in sRGB")
     count = gaussian.count
     table = np.asarray(gaussian.sh_coeffs, np.float32)
     higher = table[:, 3:].reshape(count, 3, -1).transpose(0, 2, 1)  # channel by channel

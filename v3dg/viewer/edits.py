@@ -14,7 +14,7 @@ def check_new_name(name: str) -> None:
     """Raise ValueError unless a name is a visible file name without a folder and with
     the suffix of an asset."""
     is_plain = is_one_line(name) and not name.startswith(".") and "/" not in name
-    check("name", is_plain and "\\" not in name, "a file name without a folder, got another name")
+    check("name", is_plain and "\\" not in name, f"a file name without a folder, got {name!a}")
     stem_is_there = not name.lower().startswith(WRITE_SUFFIXES)
     is_asset = name.lower().endswith(WRITE_SUFFIXES) and stem_is_there
     check("name", is_asset, f"a name ending in {', '.join(WRITE_SUFFIXES)}, got {name}")

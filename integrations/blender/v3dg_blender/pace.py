@@ -22,7 +22,7 @@ class Pace:
         """Return whether something has changed and the pause is over."""
         return key != self._key and now_s >= self._not_before_s
 
-    def note(self, key: object, end_s: float, seconds: float) -> None:
+    def record(self, key: object, end_s: float, seconds: float) -> None:
         """Record that the cut for a key has ended and took some seconds."""
         self._key = key
         self._not_before_s = end_s + max(_LEAST_PAUSE_S, _PAUSE_FACTOR * seconds)

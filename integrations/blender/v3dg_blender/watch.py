@@ -127,7 +127,7 @@ def _look() -> float:
     if _state.pace.is_due(key, start_s) and world.sources():
         _show(scene, viewport)
         end_s = time.monotonic()
-        _state.pace.note(key, end_s, end_s - start_s)
+        _state.pace.record(key, end_s, end_s - start_s)
         viewport.region.tag_redraw()
     return _LOOK_EVERY_S
 

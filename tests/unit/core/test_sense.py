@@ -255,11 +255,3 @@ def test_assets_have_the_channels_of_the_cpu_on_a_device(light, stop):
         expected = v3dg.render(asset, camera, device="cpu", mesh=mesh, **options)
         image = v3dg.render(asset, camera, device="cuda", mesh=mesh, **options)
         assert_like_cpu(image, expected, planes)
-
-
-@pytest.mark.gpu
-def test_a_device_refuses_what_it_cannot_draw():
-    camera = scenes.CAMERAS["plain"]
-    asset = scenes.random_gaussians(3, camera, 20)
-    with pytest.raises(ValueError, match="'clipped' is drawn only on the CPU"):
-        v3dg.render(asset, camera, device="cuda", channels=("clipped",))

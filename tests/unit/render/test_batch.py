@@ -521,6 +521,14 @@ def test_more_gaussians_than_a_frame_can_have_are_drawn_in_parts():
     np.testing.assert_array_equal(host(batch.color[63]), host(alone.color))
     again = renderer.render_batch(cameras[:2], tolerance=0.0)  # has no error of the parts before
     np.testing.assert_array_equal(host(again.color[0]), host(batch.color[0]))
+    # Batches that fit are soon drawn as a whole.
+    parts = [renderer.render_batch(cameras, tolerance=50.0).stats.num_parts for _ in range(16)]
+    assert parts == sorted(parts, reverse=True)
+    assert parts[0] > 1
+    assert parts[-1] == 1
+    once_more = renderer.render_batch(cameras, tolerance=0.0)
+    assert once_more.stats.num_parts > 1
+    np.testing.assert_array_equal(host(once_more.color), host(batch.color))
 
 
 @pytest.mark.gpu

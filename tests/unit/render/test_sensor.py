@@ -12,7 +12,7 @@ from frames import composed_scene
 from random_bundle import random_bundle
 from v3dg import BatchPlanes, Camera, MeshLayer, Scene, _core
 from v3dg._device import CPU
-from v3dg.render import shade_of
+from v3dg.render import api, shade_of
 from v3dg.residency import residency
 
 WIDTH = 45
@@ -189,8 +189,61 @@ def test_both_eyes_of_a_stereo_camera_have_channels(scene):
     left, right = v3dg.render(scene, stereo, channels=("normal", "weight"), device="cpu")
     assert left.normal.any()
     assert not np.array_equal(left.weight, right.weight)
-    with pytest.raises(ValueError, match="mesh: expected one camera, got two eyes"):
-        v3dg.render(scene, stereo, mesh=mesh_of((HEIGHT, WIDTH)), device="cpu")
+
+
+def assert_pictures_among_meshes(subject, cameras, mesh, layers, **options):
+    """Compare pictures with those of each camera alone."""
+    pictures = v3dg.render(subject, cameras, mesh=mesh, channels=CHANNELS, device="cpu", **options)
+    for picture, camera, layer in zip(pictures, cameras, layers, strict=True):
+        alone = v3dg.render(subject, camera, mesh=layer, channels=CHANNELS, device="cpu", **options)
+        assert_same(picture, alone)
+
+
+def test_cameras_of_a_list_have_meshes_of_their_own(scene, monkeypatch):
+    cameras = [camera_at(), camera_at((0, -5, 2)), camera_at((1, -7, 0))]
+    layers = [mesh_of((HEIGHT, WIDTH), seed=seed) for seed in range(3)]
+    joined = MeshLayer.joined(layers)
+    for mesh in (layers, tuple(layers), joined):
+        assert_pictures_among_meshes(scene, cameras, mesh, layers)
+        assert_pictures_among_meshes(scene, cameras, mesh, layers, budget=2000)
+    monkeypatch.setattr(api, "_MOST_PIXELS_A_CALL", 2 * HEIGHT * WIDTH)
+    assert_pictures_among_meshes(scene, cameras, joined, layers)
+    batch = v3dg.Renderer(scene, device="cpu").render_batch(cameras, mesh=layers)
+    whole = v3dg.Renderer(scene, device="cpu").render_batch(cameras, mesh=joined)
+    np.testing.assert_array_equal(batch.color, whole.color)
+    sizes = [cameras[0], cameras[1].scaled(2)]
+    two = [layers[0], mesh_of((2 * HEIGHT, 2 * WIDTH))]
+    assert_pictures_among_meshes(scene, sizes, two, two)
+
+
+def test_eyes_have_meshes_of_their_own(scene):
+    stereo = v3dg.StereoCamera.of(camera_at(), 0.06)
+    layers = [mesh_of((HEIGHT, WIDTH), seed=seed) for seed in range(2)]
+    cut = v3dg.select(scene, stereo, device="cpu")
+    asset = scenes_lod.blob(np.random.default_rng(5), 300)
+    for subject, given in ((scene, None), (scene, cut), (asset, None)):
+        options = {"channels": CHANNELS[:-1], "device": "cpu"}
+        eyes = v3dg.render(subject, stereo, mesh=layers, cut=given, **options)
+        if subject is scene:
+            options["cut"] = cut
+        for eye, camera, layer in zip(eyes, stereo.eyes, layers, strict=True):
+            alone = v3dg.render(subject, camera, mesh=layer, **options)
+            assert_same(eye, alone, PLANES[:-1])
+        with pytest.raises(ValueError, match=r"mesh: expected planes of shape \(2, .*got \(70, 45"):
+            v3dg.render(subject, stereo, mesh=layers[0], cut=given, device="cpu")
+
+
+def test_colours_of_8_bits_are_those_of_images(scene):
+    shape = (HEIGHT, WIDTH)
+    bytes_of_mesh = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    depth = np.full(shape, 3.0)
+    options = {"device": "cpu", "channels": ("instance",)}
+    picture = v3dg.render(scene, camera_at(), mesh=MeshLayer(bytes_of_mesh, depth), **options)
+    floats = MeshLayer(bytes_of_mesh / np.float32(255), depth)
+    assert_same(picture, v3dg.render(scene, camera_at(), mesh=floats, **options), ("color",))
+    for wrong in (bytes_of_mesh.astype(np.int64), bytes_of_mesh > 3):
+        with pytest.raises(ValueError, match=r"mesh.color: expected floats, 1 for white, or uint8"):
+            v3dg.render(scene, camera_at(), mesh=MeshLayer(wrong, depth), **options)
 
 
 def draw_window(scene, cut, window, mesh):
@@ -324,9 +377,35 @@ def test_wrong_meshes_and_channels_are_refused(scene):
     for options, kind, text in cases:
         with pytest.raises(kind, match=text):
             v3dg.render(scene, camera, device="cpu", **options)
-    with pytest.raises(ValueError, match="mesh: expected one camera, got a list"):
-        v3dg.render(scene, [camera], mesh=mesh_of(shape), device="cpu")
     lens = dataclasses.replace(camera, distortion=(0.1, 0.01, 0.0, 0.0), model="OPENCV")
     assert v3dg.render(scene, lens, channels=("normal",), device="cpu").normal.any()
     with pytest.raises(ValueError, match="'clipped' is defined for pinholes"):
         v3dg.render(scene, lens, channels=("clipped",), device="cpu")
+
+
+def test_wrong_lists_of_meshes_are_refused(scene):
+    shape = (HEIGHT, WIDTH)
+    camera = camera_at()
+    small = MeshLayer(np.zeros((4, 5, 3)), np.ones((4, 5)))
+    mesh = mesh_of(shape)
+    lists = [
+        (mesh, ValueError, r"mesh.depth: expected shape \(B, H, W\) for a list of cameras"),
+        ([mesh], ValueError, "mesh: expected a layer for each of 2 cameras, got 1"),
+        (mesh_of((3, *shape)), ValueError, "mesh: expected a layer for each of 2 cameras, got 3"),
+        ([mesh, small], ValueError, r"mesh\[1\].depth: expected shape \(70, 45\)"),
+        ([mesh, camera], TypeError, r"mesh\[1\]: expected a MeshLayer"),
+        (3, TypeError, "mesh: expected a MeshLayer, or a list of them"),
+        (
+            [mesh, dataclasses.replace(mesh, light="linear")],
+            ValueError,
+            r"mesh\[1\].light: expected 'display' as in the first layer",
+        ),
+        (
+            [mesh, dataclasses.replace(mesh, coverage=None)],
+            ValueError,
+            r"mesh\[1\].coverage: expected a plane in every layer or in none",
+        ),
+    ]
+    for layers, kind, text in lists:
+        with pytest.raises(kind, match=text):
+            v3dg.render(scene, [camera, camera], mesh=layers, device="cpu")

@@ -13,6 +13,7 @@ from devices import host, on
 from frames import composed_scene, tensors_of
 from random_bundle import random_bundle
 from v3dg import BatchPlanes, Camera, CameraBatch, MeshLayer, Scene
+from v3dg.donut import make_donut
 
 pytestmark = pytest.mark.gpu
 
@@ -264,6 +265,161 @@ def test_stereo_cameras_and_lenses_have_channels(scene):
     assert_devices_agree(scene, lens, mesh=mesh_of((HEIGHT, WIDTH)))
 
 
+@pytest.fixture(scope="module")
+def clipped_scenes():
+    """Return scenes of small objects, of which the second has factors."""
+    rng = np.random.default_rng(6)
+    bundle = scenes_lod.lod_bundle(rng, make_donut(1500), 32)
+    scenes = []
+    for factors in ({}, {"opacity": rng.uniform(0.1, 1, 24)}):
+        scene = Scene()
+        positions = rng.uniform(-3, 3, (24, 3))
+        scales = rng.uniform(0.3, 0.7, 24)
+        scene.add(bundle, positions, rng.normal(size=(24, 4)), scales, **factors)
+        scenes.append(scene)
+    return scenes
+
+
+def near_camera(seed):
+    """Return a camera among the objects, before whose near plane some of them are."""
+    rng = np.random.default_rng(seed)
+    eye = rng.uniform(-1, 1, 3)
+    target = eye + rng.normal(size=3)
+    return Camera.look_at(eye, target, (0, 0, 1), 0.9, width=WIDTH, height=HEIGHT, near=1.0)
+
+
+def inside_camera():
+    """Return a camera in the middle of a blob."""
+    return Camera.look_at(
+        (0, 0, 0), (0, 1, 0), (0, 0, 1), 0.9, width=WIDTH, height=HEIGHT, near=0.4
+    )
+
+
+def assert_clipped_as_on_the_cpu(subject, camera, **options):
+    """Compare the channel `clipped` of both devices, and return the share of clipped
+    pixels. Only pixels at the borders of bodies may differ."""
+    made = [
+        v3dg.render(subject, camera, channels=("clipped",), device=device, **options)
+        for device in ("cuda", "cpu")
+    ]
+    pictures = [picture if isinstance(picture, tuple) else (picture,) for picture in made]
+    for picture, expected in zip(*pictures, strict=True):
+        got = host(picture.clipped)
+        assert got.dtype == np.bool_
+        assert (got != expected.clipped).mean() < 0.003
+    return expected.clipped.mean()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [*OPTIONS, {"budget": 3000}, {"memory": 1 << 26, "tolerance": 1.0}],
+)
+def test_clipped_pixels_are_those_of_the_cpu(clipped_scenes, options):
+    for subject in clipped_scenes:
+        shares = [
+            assert_clipped_as_on_the_cpu(subject, near_camera(seed), **options) for seed in range(6)
+        ]
+        assert 0.01 < np.mean(shares) < 0.9
+
+
+def test_clipped_pixels_of_other_subjects_are_those_of_the_cpu(clipped_scenes):
+    for seed in range(3):
+        stereo = v3dg.StereoCamera.of(near_camera(seed), 0.1)
+        assert_clipped_as_on_the_cpu(clipped_scenes[0], stereo)
+    rng = np.random.default_rng(2)
+    asset = scenes_lod.blob(rng, 700)
+    view = inside_camera()
+    assert assert_clipped_as_on_the_cpu(asset, view) > 0.01
+    bundle = scenes_lod.lod_bundle(rng, asset, 64)
+    assert assert_clipped_as_on_the_cpu(bundle, view) > 0.01
+    cut = v3dg.select(bundle, view, tolerance=2.0, fade=1.5, cull=False, device="cpu")
+    assert assert_clipped_as_on_the_cpu(bundle, view, cut=cut) > 0.01
+    coded = random_bundle(1, num_levels=3, sh_degree=1, codec="quantized")
+    shown = v3dg.first_camera(coded, WIDTH, HEIGHT)
+    means = coded.level_gaussians(0).means
+    depths = means @ shown.viewmat[2, :3] + shown.viewmat[2, 3]
+    inside = dataclasses.replace(shown, near=float(np.percentile(depths, 25)))
+    assert assert_clipped_as_on_the_cpu(coded, inside, tolerance=0.0) > 0.01
+
+
+def test_a_batch_marks_the_clipped_pixels_of_each_camera_alone(clipped_scenes):
+    import torch
+
+    scene = clipped_scenes[1]
+    cameras = [near_camera(seed) for seed in range(7)]
+    renderer = v3dg.Renderer(scene, device="cuda", memory=None)
+    batch = renderer.render_batch(cameras, channels=("clipped", "depth"))
+    assert host(batch.clipped).any()
+    for number, camera in enumerate(cameras):
+        alone = renderer.render(camera, channels=("clipped",))
+        np.testing.assert_array_equal(host(batch.clipped[number]), host(alone.clipped))
+    plain = renderer.render_batch(cameras, channels=("depth",))
+    assert torch.equal(batch.color, plain.color)
+    assert torch.equal(batch.depth, plain.depth)
+    there = tensors_of(cameras, near=1.0)
+    planes = BatchPlanes(torch.zeros(7, HEIGHT, WIDTH, 3, device="cuda"))
+    renderer.render_batch(there, channels=("clipped",), out=planes).wait()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = renderer.render_batch(there, channels=("clipped",), out=planes)
+    for clipped in (batch.clipped, batch.clipped.flip(0)):
+        graph.replay()
+        torch.cuda.synchronize()
+        assert torch.equal(captured.clipped, clipped)
+        there.viewmats.copy_(there.viewmats.flip(0).clone())
+
+
+def test_cameras_of_an_environment_are_clipped_by_its_instances():
+    rng = np.random.default_rng(4)
+    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 300), 32)
+    scene = Scene()
+    scene.add(bundle, positions=[[9, 0, 0], [0, 0, 0]], environment=[0, 1])
+    view = Camera.look_at(
+        (0, 0, 0), (0, 1, 0), (0, 0, 1), 0.9, width=WIDTH, height=HEIGHT, near=0.4
+    )
+    cameras = CameraBatch.of([view, view], environments=[0, 1])
+    batch = v3dg.Renderer(scene, device="cuda").render_batch(cameras, channels=("clipped",))
+    assert not host(batch.clipped[0]).any()
+    assert host(batch.clipped[1]).any()
+
+
+def test_lists_and_eyes_have_meshes_of_their_own(scene):
+    cameras = cameras_around(3)
+    layers = [mesh_of((HEIGHT, WIDTH), seed=seed) for seed in range(3)]
+    there = [on_cuda(layer) for layer in layers]
+    expected = [
+        v3dg.render(scene, camera, mesh=layer, channels=CHANNELS, device="cuda")
+        for camera, layer in zip(cameras, there, strict=True)
+    ]
+    for mesh in (there, layers, MeshLayer.joined(there)):
+        drawn = v3dg.render(scene, cameras, mesh=mesh, channels=CHANNELS, device="cuda")
+        for image, alone in zip(drawn, expected, strict=True):
+            assert_same(image, alone)
+    stereo = v3dg.StereoCamera.of(camera_at(), 0.06)
+    eyes = v3dg.render(scene, stereo, mesh=there[:2], channels=CHANNELS, device="cuda")
+    for eye, wanted in zip(
+        eyes,
+        v3dg.render(scene, stereo, mesh=layers[:2], channels=CHANNELS, device="cpu"),
+        strict=True,
+    ):
+        assert_like_cpu(eye, wanted)
+
+
+def test_tensors_of_8_bits_are_colours_of_images(scene):
+    import torch
+
+    mesh = on_cuda(mesh_of((HEIGHT, WIDTH)))
+    colors = torch.randint(0, 256, (HEIGHT, WIDTH, 3), dtype=torch.uint8, device="cuda")
+    pictures = [
+        v3dg.render(scene, camera_at(), mesh=dataclasses.replace(mesh, color=color), device="cuda")
+        for color in (colors, colors.float() / 255)
+    ]
+    assert torch.equal(pictures[0].color, pictures[1].color)
+    wrong = dataclasses.replace(mesh, color=colors.int())
+    with pytest.raises(ValueError, match=r"mesh.color: expected floats, 1 for white, or uint8"):
+        v3dg.render(scene, camera_at(), mesh=wrong, device="cuda")
+
+
 def test_planes_of_the_caller_are_written(scene):
     cameras = cameras_around(5)
     mesh = mesh_of((5, HEIGHT, WIDTH))
@@ -426,10 +582,6 @@ def test_a_device_refuses_what_it_cannot_draw(scene):
     import torch
 
     renderer = v3dg.Renderer(scene, device="cuda", memory=None)
-    with pytest.raises(ValueError, match="'clipped' is drawn only on the CPU"):
-        renderer.render(camera_at(), channels=("clipped",))
-    with pytest.raises(ValueError, match="'clipped' is drawn only on the CPU"):
-        renderer.render_batch([camera_at()], channels=("normal", "clipped"))
     mesh = on_cuda(mesh_of((HEIGHT, WIDTH)))
     cases = [
         ({"color": host(mesh.color)}, "mesh.color: expected a tensor on cuda:0"),

@@ -1,6 +1,6 @@
 // Reads the tables of a bundle file (docs/format.md) and says where its pages are.
 
-import { Problem } from "./source.js";
+import { UserError } from "./source.js";
 
 /** @typedef {import("./core.js").Core} Core */
 /** @typedef {import("./source.js").Source} Source */
@@ -148,7 +148,7 @@ export class BundleFile {
 
   /** @param {string} text */
   problem(text) {
-    return new Problem(`${this.source.name}: ${text}`);
+    return new UserError(`${this.source.name}: ${text}`);
   }
 
   /**
@@ -246,7 +246,7 @@ export class BundleFile {
   }
 
   /**
-   * Throw Problem unless the bytes of a page match its hash and are valid.
+   * Throw UserError unless the bytes of a page match its hash and are valid.
    *
    * @param {Core} core
    * @param {number} page
@@ -269,7 +269,7 @@ export class BundleFile {
 async function readHeader(source) {
   let bytes = await source.read(0, FIRST_BYTES);
   const refuse = (/** @type {string} */ expected) =>
-    new Problem(`${source.name}: expected ${expected}; write it with v3dg`);
+    new UserError(`${source.name}: expected ${expected}; write it with v3dg`);
   if (bytes.length < 8) throw refuse("a v3dg bundle");
   const length = new DataView(bytes.buffer, bytes.byteOffset).getBigUint64(0, true);
   if (length > MOST_HEADER_BYTES) throw refuse("a v3dg bundle");

@@ -3,6 +3,7 @@
 import { AXES, Camera, isMode } from "./camera.js";
 import * as M from "./math.js";
 import { eyeOf } from "./placement.js";
+import { isDrawable } from "./renderer.js";
 import { open } from "./viewer.js";
 
 /** @typedef {import("./scene_file.js").NamedCamera} NamedCamera */
@@ -241,7 +242,8 @@ class Page {
 
   /** Draw what the camera sees. */
   redraw() {
-    const ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO);
+    let ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO);
+    while (!isDrawable(canvas.clientWidth * ratio, canvas.clientHeight * ratio)) ratio /= 2;
     const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
     const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
     const { camera } = this;

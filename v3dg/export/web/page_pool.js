@@ -3,7 +3,7 @@
 // it, and leaves before that one, so the pool is closed towards the root. The page that
 // was not needed for longest leaves first.
 
-import { Problem } from "./source.js";
+import { UserError } from "./source.js";
 
 /** @typedef {import("./bundle_file.js").BundleFile} BundleFile */
 /** @typedef {{ bundle: number, page: number, priority: number }} Wanted */
@@ -86,7 +86,7 @@ export class PagePool {
     }
     if (bytes < end) {
       const needed = `${Math.ceil(end / 2 ** 20)} MiB`;
-      throw new Problem(`pool: the coarsest pages of all bundles need ${needed}; raise its size`);
+      throw new UserError(`pool: the coarsest pages of all bundles need ${needed}; raise its size`);
     }
     this.firstSlot = end;
     this.slotBytes = slotBytes;
@@ -131,7 +131,7 @@ export class PagePool {
    * @param {number} frame
    * @returns {Wanted[]}
    */
-  note(bundle, needs, frame) {
+  recordNeeds(bundle, needs, frame) {
     const pages = this.pages[bundle];
     const { file, lastNeeded } = pages;
     /** @type {Map<number, Wanted>} */

@@ -127,13 +127,14 @@ export function placementsOf(camera, instances, indices) {
 }
 
 /**
- * Return the camera in the layout of project.wgsl and draw.wgsl.
+ * Return the camera in the layout of shared.wgsl.
  *
  * @param {Pinhole} camera
  * @param {number} count Gaussians of the cut.
  * @param {number[]} background Red, green and blue, 0 to 1.
+ * @param {number} minTransmittance Behind which pixels stop.
  */
-export function cameraBlock({ k, near, width, height }, count, background) {
+export function cameraBlock({ k, near, width, height }, count, background, minTransmittance) {
   const [fx, , cx, , fy, cy] = Array.from(k);
   const marginX = (FOV_MARGIN * width) / (2 * fx);
   const marginY = (FOV_MARGIN * height) / (2 * fy);
@@ -143,5 +144,6 @@ export function cameraBlock({ k, near, width, height }, count, background) {
   block.set([-(cx / fx + marginX), -(cy / fy + marginY)], 8);
   block.set([(width - cx) / fx + marginX, (height - cy) / fy + marginY], 10);
   block.set(background, 12);
+  block[15] = minTransmittance;
   return block;
 }

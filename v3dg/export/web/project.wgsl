@@ -25,11 +25,12 @@ struct Pair {
   weight: f32,
 }
 
-struct DrawArguments {
-  num_vertices: u32,
-  num_instances: atomic<u32>,
-  first_vertex: u32,
-  first_instance: u32,
+// As Sizes, whose numbers other workgroups change meanwhile.
+struct CountedSizes {
+  num_keys: u32,
+  lowest_key: atomic<u32>,
+  highest_key: atomic<u32>,
+  num_items: atomic<u32>,
 }
 
 const kThreads = 256u;
@@ -49,10 +50,6 @@ const kQuatLength2 = 444016.0;
 const kQuatStep = 0.0015007235;
 const kStepUnit = 0.00390625;
 
-// Depths are sorted by these upper bits of their float32 bits.
-const kDepthShift = 3u;
-const kNotDrawn = 0xffffffffu >> 4u;
-
 @group(0) @binding(0) var<uniform> camera: Camera;
 @group(0) @binding(1) var<storage, read> pool: array<u32>;
 @group(0) @binding(2) var<storage, read> pairs: array<Pair>;
@@ -60,8 +57,7 @@ const kNotDrawn = 0xffffffffu >> 4u;
 @group(0) @binding(4) var<storage, read> placements: array<Placement>;
 @group(0) @binding(5) var<storage, read_write> records: array<Record>;
 @group(0) @binding(6) var<storage, read_write> keys: array<u32>;
-@group(0) @binding(7) var<storage, read_write> values: array<u32>;
-@group(0) @binding(8) var<storage, read_write> arguments: DrawArguments;
+@group(0) @binding(7) var<storage, read_write> sizes: CountedSizes;
 
 fn low_half(word: u32) -> f32 {
   return unpack2x16float(word).x;
@@ -207,15 +203,22 @@ fn pair_of(gaussian: u32) -> u32 {
   return pair;
 }
 
-@compute @workgroup_size(kThreads)
-fn project(@builtin(global_invocation_id) id: vec3u) {
-  let index = id.x;
-  if (index >= camera.count) {
-    return;
+// Returns the number of tiles with a pixel centre in the ellipse.
+fn num_tiles_reached(record: Record, reach: f32) -> u32 {
+  let l = vec3f(record.l11, record.l12, record.l22);
+  let num_tiles = num_tiles_of(camera.size);
+  let rows = tile_rows_of(record.center, l, reach, num_tiles.y);
+  var count = 0u;
+  for (var row = rows.x; row < rows.y; row++) {
+    let columns = tile_columns_of(record.center, l, reach, row, num_tiles.x);
+    count += columns.y - columns.x;
   }
-  values[index] = index;
-  keys[index] = kNotDrawn;
+  return count;
+}
 
+// Writes the record of a gaussian, and returns the bits of its depth; kNotDrawn if it
+// is not in the picture.
+fn project_one(index: u32) -> u32 {
   let pair_index = pair_of(index);
   let pair = pairs[pair_index];
   let degree = pair.look >> kDegreeShift;
@@ -234,7 +237,7 @@ fn project(@builtin(global_invocation_id) id: vec3u) {
     dot(place.row_z.xyz, from_eye) + place.row_z.w,
   );
   if (!(p.z >= camera.near) || g.opacity < kMinAlpha) {
-    return;
+    return kNotDrawn;
   }
 
   // The rows of J W R S.
@@ -272,12 +275,11 @@ fn project(@builtin(global_invocation_id) id: vec3u) {
 
   let reach = record.log2_opacity - kLog2MinAlpha;
   if (!(reach >= 0.0 && det > 0.0 && det < kLargest && c11 < kLargest && c22 < kLargest)) {
-    return;
+    return kNotDrawn;
   }
-  let half_size = sqrt(reach * vec2f(c11, c22)) * (1.0 / kFalloffScale);
-  if (any(record.center + half_size <= vec2f(0.0)) ||
-      any(record.center - half_size >= camera.size)) {
-    return;
+  let num_tiles = num_tiles_reached(record, reach);
+  if (num_tiles == 0u) {
+    return kNotDrawn;
   }
 
   var color = 0.28209479177387814 * g.color + 0.5;
@@ -289,8 +291,39 @@ fn project(@builtin(global_invocation_id) id: vec3u) {
   }
   color = min(max(color, vec3f(0.0)) * place.tint.rgb, vec3f(kLargestHalf));
   record.red_green = pack2x16float(color.rg);
-  record.blue = pack2x16float(vec2f(color.b, 0.0));
+  record.blue_tiles = pack2x16float(vec2f(color.b, 0.0)) | (num_tiles << 16u);
   records[index] = record;
-  keys[index] = bitcast<u32>(p.z) >> kDepthShift;
-  atomicAdd(&arguments.num_instances, 1u);
+  return bitcast<u32>(p.z);
+}
+
+var<workgroup> lowest_key: atomic<u32>;
+var<workgroup> highest_key: atomic<u32>;
+var<workgroup> num_drawn: atomic<u32>;
+
+@compute @workgroup_size(kThreads)
+fn project(
+  @builtin(global_invocation_id) id: vec3u,
+  @builtin(local_invocation_index) thread: u32,
+) {
+  if (thread == 0u) {
+    atomicStore(&lowest_key, kNotDrawn);
+    atomicStore(&highest_key, 0u);
+    atomicStore(&num_drawn, 0u);
+  }
+  workgroupBarrier();
+  if (id.x < camera.count) {
+    let key = project_one(id.x);
+    keys[id.x] = key;
+    if (key != kNotDrawn) {
+      atomicMin(&lowest_key, key);
+      atomicMax(&highest_key, key);
+      atomicAdd(&num_drawn, 1u);
+    }
+  }
+  workgroupBarrier();
+  if (thread == 0u && atomicLoad(&num_drawn) > 0u) {
+    atomicMin(&sizes.lowest_key, atomicLoad(&lowest_key));
+    atomicMax(&sizes.highest_key, atomicLoad(&highest_key));
+    atomicAdd(&sizes.num_items, atomicLoad(&num_drawn));
+  }
 }

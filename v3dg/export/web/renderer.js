@@ -1,6 +1,21 @@
-// Draws cuts with WebGPU: gaussians are decoded and projected, sorted by depth, and
-// blended as quads from back to front (project.wgsl, sort.wgsl, draw.wgsl).
+// Draws cuts with WebGPU: gaussians are decoded and projected (project.wgsl), sorted by
+// depth (sort.wgsl), listed for each tile of the picture (tiles.wgsl, sort.wgsl), and
+// blended tile by tile (draw.wgsl). v3dg/render/webgpu does the same in Python.
 
+import {
+  BYTES_OF_SIZES,
+  DEPTH_PASSES,
+  DEPTH_SIDES,
+  DIGITS,
+  FrameBuffers,
+  GAUSSIANS_OF_WORKGROUP,
+  KEYS_OF_TILE,
+  MOST_TILES,
+  PAIRS_OF_WORKGROUP,
+  TILE_PASSES,
+  TILE_SIDES,
+} from "./frame_buffers.js";
+import { PICTURE_FORMAT, Pipelines } from "./pipelines.js";
 import { cameraBlock, placementsOf } from "./placement.js";
 
 /** @typedef {import("./placement.js").Instances} Instances */
@@ -12,45 +27,28 @@ import { cameraBlock, placementsOf } from "./placement.js";
  * @property {Uint32Array} firstPairs Pair of the first gaussian of each workgroup.
  * @property {Int32Array} instances The instances that pairs refer to.
  */
+/**
+ * @typedef {object} Sort
+ * @property {string} uniforms
+ * @property {number} numPasses Each moves keys and values to the other side.
+ * @property {string[][]} sides Keys and values.
+ * @property {string} sizes
+ * @property {number} most Largest number of keys.
+ */
 
+export { GAUSSIANS_OF_WORKGROUP };
 export const WORDS_OF_PAIR = 8;
-export const GAUSSIANS_OF_WORKGROUP = 256;
-const KEYS_OF_TILE = 2048;
-const DIGITS = 16;
-const NUM_PASSES = 7;
-const BYTES_OF_RECORD = 32;
-const BYTES_OF_ARGUMENTS = 16;
-/** Distance between the uniforms of sorting passes: the alignment that devices need. */
-const UNIFORM_STRIDE = 256;
-const PICTURE_FORMAT = "rgba16float";
-const LEAST_CAPACITY = 1 << 14;
-
-const OVER = /** @type {const} */ ({
-  srcFactor: "one",
-  dstFactor: "one-minus-src-alpha",
-  operation: "add",
-});
-
-/** The bindings of sort.wgsl, which all of its pipelines share. */
-function sortEntries() {
-  const read = "read-only-storage";
-  const types = /** @type {const} */ (["uniform", read, read, "storage", "storage", "storage"]);
-  const visibility = GPUShaderStage.COMPUTE;
-  return types.map((type, binding) => ({ binding, visibility, buffer: { type } }));
-}
+const SIDE_OF_TILE = 16;
+const NOT_DRAWN = 0xffffffff;
+const BYTES_OF_PIXEL = 16;
+const ROW_ALIGNMENT = 256;
+/** Place of `num_items` in Sizes of shared.wgsl. */
+const WORD_OF_ITEMS = 3;
+/** As `v3dg.render` draws cuts up to the default tolerance. */
+const MIN_TRANSMITTANCE = 1e-4;
 
 /** The browser or the device cannot draw. The message is for users. */
 export class NoDevice extends Error {}
-
-/**
- * @param {string} name
- * @returns {Promise<string>}
- */
-async function shaderText(name) {
-  const response = await fetch(new URL(name, import.meta.url));
-  if (!response.ok) throw new Error(`${name}: the server answered ${response.status}`);
-  return response.text();
-}
 
 /** @returns {Promise<GPUDevice>} */
 async function requestDevice() {
@@ -65,6 +63,21 @@ async function requestDevice() {
   });
 }
 
+/** @param {Pinhole} camera */
+function tilesOf({ width, height }) {
+  return [Math.ceil(width / SIDE_OF_TILE), Math.ceil(height / SIDE_OF_TILE)];
+}
+
+/**
+ * Return whether a picture is small enough to be drawn.
+ *
+ * @param {number} width
+ * @param {number} height
+ */
+export function isDrawable(width, height) {
+  return Math.ceil(width / SIDE_OF_TILE) * Math.ceil(height / SIDE_OF_TILE) <= MOST_TILES;
+}
+
 export class Renderer {
   /**
    * @param {HTMLCanvasElement | OffscreenCanvas} canvas
@@ -72,15 +85,9 @@ export class Renderer {
    */
   static async create(canvas, poolBytes) {
     const device = await requestDevice();
-    const names = ["shared.wgsl", "project.wgsl", "sort.wgsl", "draw.wgsl"];
-    const [shared, project, sort, draw] = await Promise.all(names.map(shaderText));
-    const compiled = (/** @type {string} */ code) => device.createShaderModule({ code });
     const renderer = new Renderer(device, canvas, poolBytes);
-    await renderer.makePipelines(
-      compiled(shared + project),
-      compiled(sort),
-      compiled(shared + draw),
-    );
+    renderer.pipelines = await Pipelines.create(device);
+    renderer.finishCanvas = await renderer.pipelines.finishing(renderer.canvasFormat);
     return renderer;
   }
 
@@ -93,89 +100,37 @@ export class Renderer {
     this.device = device;
     this.canvas = canvas;
     const { maxStorageBufferBindingSize, maxBufferSize } = device.limits;
-    this.mostBytes = Math.min(maxStorageBufferBindingSize, maxBufferSize);
-    this.poolBytes = Math.min(poolBytes, this.mostBytes);
+    const mostBytes = Math.min(maxStorageBufferBindingSize, maxBufferSize);
+    this.poolBytes = Math.min(poolBytes, mostBytes);
     this.canvasFormat = navigator.gpu.getPreferredCanvasFormat();
     this.context = /** @type {GPUCanvasContext} */ (canvas.getContext("webgpu"));
     this.context.configure({ device, format: this.canvasFormat, alphaMode: "opaque" });
-    const { STORAGE, COPY_DST, UNIFORM, INDIRECT } = GPUBufferUsage;
-    this.pool = this.buffer(this.poolBytes, STORAGE | COPY_DST);
-    this.camera = this.buffer(64, UNIFORM | COPY_DST);
-    this.arguments = this.buffer(BYTES_OF_ARGUMENTS, STORAGE | INDIRECT | COPY_DST);
-    this.passes = this.buffer(NUM_PASSES * UNIFORM_STRIDE, UNIFORM | COPY_DST);
-    /** Buffers for the cut, by name, which grow. @type {Map<string, GPUBuffer>} */
-    this.buffers = new Map();
-    /** Largest number of gaussians that the buffers have room for. */
-    this.capacity = 0;
+    const { STORAGE, COPY_DST } = GPUBufferUsage;
+    this.pool = device.createBuffer({ size: this.poolBytes, usage: STORAGE | COPY_DST });
+    this.buffers = new FrameBuffers(device, mostBytes);
     /** @type {Cut} */
     this.cut = null;
     /** @type {GPUTexture} */
     this.picture = null;
-    this.reserve(LEAST_CAPACITY);
+    /** Whether checkPairs() is under way, and whether a picture was drawn meanwhile. */
+    this.isChecking = false;
+    this.isUnchecked = false;
+    /** Is called when the last picture must be drawn again, with larger buffers. */
+    this.onGrown = () => {};
+    /** Is called with the number of pairs of a picture for which no buffers suffice. */
+    this.onLimit = (/** @type {number} */ _numPairs) => {};
   }
 
   /** Bytes of all buffers and pictures. */
   get memoryBytes() {
-    let bytes = this.pool.size;
-    for (const buffer of this.buffers.values()) bytes += buffer.size;
-    if (this.picture !== null) bytes += 8 * this.picture.width * this.picture.height;
+    let bytes = this.pool.size + this.buffers.bytes;
+    if (this.picture !== null) bytes += BYTES_OF_PIXEL * this.picture.width * this.picture.height;
     return bytes;
   }
 
   /** Largest number of gaussians of a cut. */
   get mostGaussians() {
-    return Math.floor(this.mostBytes / BYTES_OF_RECORD);
-  }
-
-  /**
-   * @param {number} size
-   * @param {number} usage
-   */
-  buffer(size, usage) {
-    return this.device.createBuffer({ size, usage });
-  }
-
-  /**
-   * @param {GPUShaderModule} project
-   * @param {GPUShaderModule} sort
-   * @param {GPUShaderModule} draw
-   */
-  async makePipelines(project, sort, draw) {
-    const { device } = this;
-    this.drawModule = draw;
-    this.sortLayout = device.createBindGroupLayout({ entries: sortEntries() });
-    const layout = device.createPipelineLayout({ bindGroupLayouts: [this.sortLayout] });
-    const sorting = (/** @type {string} */ entryPoint) =>
-      device.createComputePipelineAsync({ layout, compute: { module: sort, entryPoint } });
-    const projecting = { module: project, entryPoint: "project" };
-    [this.project, this.countDigits, this.sumCounts, this.moveKeys, this.draw] = await Promise.all([
-      device.createComputePipelineAsync({ layout: "auto", compute: projecting }),
-      sorting("count_digits"),
-      sorting("sum_counts"),
-      sorting("move_keys"),
-      device.createRenderPipelineAsync({
-        layout: "auto",
-        vertex: { module: draw, entryPoint: "draw_corner" },
-        fragment: {
-          module: draw,
-          entryPoint: "draw_pixel",
-          targets: [{ format: PICTURE_FORMAT, blend: { color: OVER, alpha: OVER } }],
-        },
-        primitive: { topology: "triangle-strip" },
-      }),
-    ]);
-    this.finishCanvas = await this.finishing(this.canvasFormat);
-  }
-
-  /**
-   * @param {GPUTextureFormat} format Of the finished picture.
-   */
-  finishing(format) {
-    return this.device.createRenderPipelineAsync({
-      layout: "auto",
-      vertex: { module: this.drawModule, entryPoint: "cover" },
-      fragment: { module: this.drawModule, entryPoint: "finish", targets: [{ format }] },
-    });
+    return this.buffers.mostGaussians;
   }
 
   /**
@@ -189,82 +144,16 @@ export class Renderer {
   }
 
   /**
-   * Enlarge the buffers, if necessary, for a number of gaussians.
-   *
-   * @param {number} count
-   */
-  reserve(count) {
-    if (count <= this.capacity) return;
-    this.capacity = Math.min(
-      Math.max(count, LEAST_CAPACITY, 1.25 * this.capacity),
-      this.mostGaussians,
-    );
-    this.capacity = Math.ceil(this.capacity);
-    const { STORAGE } = GPUBufferUsage;
-    this.replace("records", BYTES_OF_RECORD * this.capacity, STORAGE);
-    for (const name of ["keys", "values", "otherKeys", "otherValues"]) {
-      this.replace(name, 4 * this.capacity, STORAGE);
-    }
-    this.replace("counts", 4 * DIGITS * Math.ceil(this.capacity / KEYS_OF_TILE), STORAGE);
-  }
-
-  /**
-   * @param {string} name
-   * @param {number} bytes
-   * @param {number} usage
-   */
-  replace(name, bytes, usage) {
-    this.buffers.get(name)?.destroy();
-    this.buffers.set(name, this.buffer(bytes, usage));
-  }
-
-  /**
-   * Write an array to a buffer, which grows to hold it.
-   *
-   * @param {string} name
-   * @param {Uint32Array | Float32Array} array
-   */
-  upload(name, array) {
-    const bytes = Math.max(array.byteLength, 16);
-    if ((this.buffers.get(name)?.size ?? 0) < bytes) {
-      this.replace(
-        name,
-        4 * Math.ceil(bytes / 3),
-        GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_DST,
-      );
-    }
-    this.device.queue.writeBuffer(this.buffers.get(name), 0, array);
-  }
-
-  /**
    * Set what draw() draws.
    *
    * @param {Cut} cut
    */
   setCut(cut) {
     this.cut = cut;
-    this.reserve(cut.count);
-    this.upload("pairs", cut.pairs);
-    this.upload("firstPairs", cut.firstPairs);
-    const numTiles = Math.ceil(cut.count / KEYS_OF_TILE);
-    const passes = new Uint32Array((NUM_PASSES * UNIFORM_STRIDE) / 4);
-    for (let pass = 0; pass < NUM_PASSES; pass += 1) {
-      passes.set([cut.count, 4 * pass, numTiles], (pass * UNIFORM_STRIDE) / 4);
-    }
-    this.device.queue.writeBuffer(this.passes, 0, passes);
-  }
-
-  /**
-   * @param {GPUBindGroupLayout} layout
-   * @param {(GPUBuffer | GPUBufferBinding | GPUTextureView)[]} resources
-   * @param {number[]} bindings Their numbers; from 0 on if absent.
-   */
-  bind(layout, resources, bindings = resources.map((_, k) => k)) {
-    const entries = resources.map((resource, k) => ({
-      binding: bindings[k],
-      resource: resource instanceof GPUBuffer ? { buffer: resource } : resource,
-    }));
-    return this.device.createBindGroup({ layout, entries });
+    this.buffers.reserve(cut.count);
+    this.buffers.upload("pairs", cut.pairs);
+    this.buffers.upload("firstPairs", cut.firstPairs);
+    this.buffers.setCount(cut.count);
   }
 
   /**
@@ -279,6 +168,41 @@ export class Renderer {
     if (canvas.width !== camera.width) canvas.width = camera.width;
     if (canvas.height !== camera.height) canvas.height = camera.height;
     this.drawTo(this.context.getCurrentTexture(), this.finishCanvas, camera, instances, background);
+    this.checkPairs();
+  }
+
+  /** Return the number of pairs of gaussians and tiles in the last picture. */
+  async numPairs() {
+    const { MAP_READ, COPY_DST } = GPUBufferUsage;
+    const usage = MAP_READ | COPY_DST;
+    const buffer = this.device.createBuffer({ size: BYTES_OF_SIZES, usage });
+    const encoder = this.device.createCommandEncoder();
+    const [sizes] = this.buffers.get("pairSizes");
+    encoder.copyBufferToBuffer(sizes, 0, buffer, 0, BYTES_OF_SIZES);
+    this.device.queue.submit([encoder.finish()]);
+    await buffer.mapAsync(GPUMapMode.READ);
+    const numPairs = new Uint32Array(buffer.getMappedRange())[WORD_OF_ITEMS];
+    buffer.destroy();
+    if (numPairs > this.buffers.mostPairs) this.onLimit(numPairs);
+    return numPairs;
+  }
+
+  /** Enlarge the buffers if the last picture had more pairs than they have room for. */
+  async checkPairs() {
+    this.isUnchecked = true;
+    if (this.isChecking) return;
+    this.isChecking = true;
+    let hasGrown = false;
+    try {
+      while (this.isUnchecked) {
+        this.isUnchecked = false;
+        hasGrown = this.buffers.reservePairs(await this.numPairs()) || hasGrown;
+      }
+    } catch {
+      return; // The device is lost, and with it this renderer.
+    }
+    this.isChecking = false;
+    if (hasGrown) this.onGrown();
   }
 
   /**
@@ -294,10 +218,14 @@ export class Renderer {
     const size = [camera.width, camera.height];
     const format = "rgba32float";
     const texture = device.createTexture({ size, format, usage: COPY_SRC | RENDER_ATTACHMENT });
-    this.drawTo(texture, await this.finishing(format), camera, instances, background);
-    const bytesPerRow = Math.ceil((16 * camera.width) / UNIFORM_STRIDE) * UNIFORM_STRIDE;
+    const finish = await this.pipelines.finishing(format);
+    do {
+      this.drawTo(texture, finish, camera, instances, background);
+    } while (this.buffers.reservePairs(await this.numPairs()));
+    const bytesPerRow = Math.ceil((BYTES_OF_PIXEL * camera.width) / ROW_ALIGNMENT) * ROW_ALIGNMENT;
     const { MAP_READ, COPY_DST } = GPUBufferUsage;
-    const buffer = this.buffer(bytesPerRow * camera.height, MAP_READ | COPY_DST);
+    const usage = MAP_READ | COPY_DST;
+    const buffer = device.createBuffer({ size: bytesPerRow * camera.height, usage });
     const encoder = device.createCommandEncoder();
     encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow }, size);
     device.queue.submit([encoder.finish()]);
@@ -323,96 +251,156 @@ export class Renderer {
   drawTo(target, finish, camera, instances, background) {
     const { device, cut } = this;
     const count = cut?.count ?? 0;
-    device.queue.writeBuffer(this.camera, 0, cameraBlock(camera, count, background));
-    device.queue.writeBuffer(this.arguments, 0, Uint32Array.of(4, 0, 0, 0));
+    const [cameraBuffer, sizes, pairSizes, ranges] = this.buffers.get(
+      "camera",
+      "sizes",
+      "pairSizes",
+      "ranges",
+    );
+    const block = cameraBlock(camera, count, background, MIN_TRANSMITTANCE);
+    device.queue.writeBuffer(cameraBuffer, 0, block);
+    device.queue.writeBuffer(sizes, 0, Uint32Array.of(count, NOT_DRAWN, 0, 0));
+    device.queue.writeBuffer(pairSizes, 0, new Uint32Array(4));
+    this.resize(camera);
     const encoder = device.createCommandEncoder();
+    encoder.clearBuffer(ranges);
+    const pass = encoder.beginComputePass();
     if (count > 0) {
-      this.upload("placements", placementsOf(camera, instances, cut.instances));
-      this.encodeOrder(encoder, count);
+      this.buffers.upload("placements", placementsOf(camera, instances, cut.instances));
+      this.encodeOrder(pass, count);
+      this.encodeTiles(pass, count);
     }
-    this.encodePicture(encoder, camera, count);
-    const pass = encoder.beginRenderPass({
-      colorAttachments: [{ view: target.createView(), loadOp: "clear", storeOp: "store" }],
-    });
-    pass.setPipeline(finish);
-    const resources = [this.camera, this.picture.createView()];
-    pass.setBindGroup(0, this.bind(finish.getBindGroupLayout(0), resources, [0, 4]));
-    pass.draw(3);
+    this.encodePicture(pass, camera);
     pass.end();
+    this.encodeFinish(encoder, target, finish);
     device.queue.submit([encoder.finish()]);
   }
 
   /**
    * Project the gaussians of the cut and sort them by depth.
    *
-   * @param {GPUCommandEncoder} encoder
+   * @param {GPUComputePassEncoder} pass
    * @param {number} count
    */
-  encodeOrder(encoder, count) {
-    const get = (/** @type {string} */ name) => this.buffers.get(name);
-    const pass = encoder.beginComputePass();
-    pass.setPipeline(this.project);
-    const inputs = [this.camera, this.pool, get("pairs"), get("firstPairs"), get("placements")];
-    const outputs = [get("records"), get("keys"), get("values"), this.arguments];
-    pass.setBindGroup(0, this.bind(this.project.getBindGroupLayout(0), [...inputs, ...outputs]));
+  encodeOrder(pass, count) {
+    const { pipelines, buffers } = this;
+    const [camera] = buffers.get("camera");
+    const inputs = buffers.get("pairs", "firstPairs", "placements");
+    const outputs = buffers.get("records", "keys", "sizes");
+    pass.setPipeline(pipelines.project);
+    const resources = [camera, this.pool, ...inputs, ...outputs];
+    pass.setBindGroup(0, pipelines.bind("projecting", resources));
     pass.dispatchWorkgroups(Math.ceil(count / GAUSSIANS_OF_WORKGROUP));
-    const numTiles = Math.ceil(count / KEYS_OF_TILE);
-    const sides = [
-      [get("keys"), get("values")],
-      [get("otherKeys"), get("otherValues")],
-    ];
-    for (let k = 0; k < NUM_PASSES; k += 1) {
-      const uniform = { buffer: this.passes, offset: k * UNIFORM_STRIDE, size: 16 };
-      const resources = [uniform, ...sides[k % 2], ...sides[1 - (k % 2)], get("counts")];
-      pass.setBindGroup(0, this.bind(this.sortLayout, resources));
-      pass.setPipeline(this.countDigits);
+    this.encodeSort(pass, {
+      uniforms: "depthPasses",
+      numPasses: DEPTH_PASSES,
+      sides: DEPTH_SIDES,
+      sizes: "sizes",
+      most: count,
+    });
+  }
+
+  /**
+   * List the pairs of gaussians and tiles, and sort them by tile.
+   *
+   * @param {GPUComputePassEncoder} pass
+   * @param {number} count Gaussians.
+   */
+  encodeTiles(pass, count) {
+    const { pipelines, buffers } = this;
+    const [, order] = DEPTH_SIDES[DEPTH_PASSES % 2];
+    const inputs = buffers.get("camera", "records", order, "sizes");
+    const outputs = buffers.get("blocks", ...TILE_SIDES[0], "pairSizes");
+    pass.setBindGroup(0, pipelines.bind("listing", [...inputs, ...outputs]));
+    const numBlocks = Math.ceil(count / GAUSSIANS_OF_WORKGROUP);
+    pass.setPipeline(pipelines.countPairs);
+    pass.dispatchWorkgroups(numBlocks);
+    pass.setPipeline(pipelines.sumBlocks);
+    pass.dispatchWorkgroups(1);
+    pass.setPipeline(pipelines.writePairs);
+    pass.dispatchWorkgroups(numBlocks);
+    this.encodeSort(pass, {
+      uniforms: "tilePasses",
+      numPasses: TILE_PASSES,
+      sides: TILE_SIDES,
+      sizes: "pairSizes",
+      most: buffers.pairCapacity,
+    });
+    pass.setPipeline(pipelines.findRanges);
+    pass.setBindGroup(0, pipelines.bind("finding", buffers.get("tiles", "pairSizes", "ranges")));
+    pass.dispatchWorkgroups(Math.ceil(buffers.pairCapacity / PAIRS_OF_WORKGROUP));
+  }
+
+  /**
+   * Sort keys with values.
+   *
+   * @param {GPUComputePassEncoder} pass
+   * @param {Sort} sort
+   */
+  encodeSort(pass, { uniforms, numPasses, sides, sizes, most }) {
+    const { pipelines, buffers } = this;
+    const numTiles = Math.ceil(most / KEYS_OF_TILE);
+    for (let k = 0; k < numPasses; k += 1) {
+      const names = [...sides[k % 2], ...sides[1 - (k % 2)], "counts", "totals", sizes];
+      const resources = [buffers.passOf(uniforms, k), ...buffers.get(...names)];
+      pass.setBindGroup(0, pipelines.bind("sorting", resources));
+      pass.setPipeline(pipelines.countDigits);
       pass.dispatchWorkgroups(numTiles);
-      pass.setPipeline(this.sumCounts);
-      pass.dispatchWorkgroups(1);
-      pass.setPipeline(this.moveKeys);
+      pass.setPipeline(pipelines.sumCounts);
+      pass.dispatchWorkgroups(DIGITS);
+      pass.setPipeline(pipelines.moveKeys);
       pass.dispatchWorkgroups(numTiles);
     }
+  }
+
+  /**
+   * Blend the gaussians of each tile.
+   *
+   * @param {GPUComputePassEncoder} pass
+   * @param {Pinhole} camera
+   */
+  encodePicture(pass, camera) {
+    const { pipelines, buffers } = this;
+    const [, gaussians] = TILE_SIDES[TILE_PASSES % 2];
+    const inputs = buffers.get("camera", "records", gaussians, "ranges");
+    const resources = [...inputs, this.picture.createView()];
+    pass.setPipeline(pipelines.blend);
+    pass.setBindGroup(0, pipelines.bind("blending", resources));
+    const [columns, rows] = tilesOf(camera);
+    pass.dispatchWorkgroups(columns, rows);
+  }
+
+  /**
+   * Put the picture over the background.
+   *
+   * @param {GPUCommandEncoder} encoder
+   * @param {GPUTexture} target
+   * @param {GPURenderPipeline} finish
+   */
+  encodeFinish(encoder, target, finish) {
+    const pass = encoder.beginRenderPass({
+      colorAttachments: [{ view: target.createView(), loadOp: "clear", storeOp: "store" }],
+    });
+    pass.setPipeline(finish);
+    const resources = [...this.buffers.get("camera"), this.picture.createView()];
+    pass.setBindGroup(0, this.pipelines.bindFinishing(finish, resources));
+    pass.draw(3);
     pass.end();
   }
 
   /**
-   * Blend the records in their order.
+   * Make a picture of the size of the camera, unless it has that size.
    *
-   * @param {GPUCommandEncoder} encoder
    * @param {Pinhole} camera
-   * @param {number} count
    */
-  encodePicture(encoder, { width, height }, count) {
-    if (this.picture?.width !== width || this.picture?.height !== height) {
-      this.picture?.destroy();
-      this.picture = this.device.createTexture({
-        size: [width, height],
-        format: PICTURE_FORMAT,
-        usage: GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.TEXTURE_BINDING,
-      });
-    }
-    const pass = encoder.beginRenderPass({
-      colorAttachments: [
-        {
-          view: this.picture.createView(),
-          clearValue: [0, 0, 0, 0],
-          loadOp: "clear",
-          storeOp: "store",
-        },
-      ],
+  resize({ width, height }) {
+    if (this.picture?.width === width && this.picture?.height === height) return;
+    this.picture?.destroy();
+    this.picture = this.device.createTexture({
+      size: [width, height],
+      format: PICTURE_FORMAT,
+      usage: GPUTextureUsage.STORAGE_BINDING | GPUTextureUsage.TEXTURE_BINDING,
     });
-    if (count > 0) {
-      pass.setPipeline(this.draw);
-      const resources = [
-        this.camera,
-        this.buffers.get("records"),
-        this.buffers.get("otherValues"),
-        this.arguments,
-      ];
-      pass.setBindGroup(0, this.bind(this.draw.getBindGroupLayout(0), resources));
-      pass.drawIndirect(this.arguments, 0);
-    }
-    pass.end();
   }
 
   /** Release the device. */

@@ -1,7 +1,7 @@
 // Reads scene files (docs/scene.md) as `v3dg export` and `v3dg.write_scene` write them:
 // bundles, instances with position, quaternion and scale, and pinhole cameras.
 
-import { Problem, nameOf } from "./source.js";
+import { UserError, nameOf } from "./source.js";
 
 /** @typedef {import("./placement.js").Instances} Instances */
 /** @typedef {import("./placement.js").Pinhole} Pinhole */
@@ -34,7 +34,7 @@ class Reader {
    * @returns {never}
    */
   refuse(place, expected) {
-    throw new Problem(`${this.name}: ${place}: expected ${expected}`);
+    throw new UserError(`${this.name}: ${place}: expected ${expected}`);
   }
 
   /**
@@ -164,13 +164,13 @@ async function loadJson(url) {
   try {
     response = await fetch(url);
   } catch {
-    throw new Problem(`${name}: the server does not answer; reload the page`);
+    throw new UserError(`${name}: the server does not answer; reload the page`);
   }
-  if (!response.ok) throw new Problem(`${name}: the server answered ${response.status}`);
+  if (!response.ok) throw new UserError(`${name}: the server answered ${response.status}`);
   try {
     return await response.json();
   } catch {
-    throw new Problem(`${name}: expected a scene in JSON`);
+    throw new UserError(`${name}: expected a scene in JSON`);
   }
 }
 

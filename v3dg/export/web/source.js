@@ -2,10 +2,10 @@
 // ranges, the whole file is read once.
 
 /** An error that is reported to the user, in one line. */
-export class Problem extends Error {}
+export class UserError extends Error {}
 
 /** A server or a network that does not answer. The read may be tried again. */
-export class Unreachable extends Problem {}
+export class Unreachable extends UserError {}
 
 /** Largest file that is read whole, bytes. */
 const MOST_WHOLE_BYTES = 2 ** 29;
@@ -52,7 +52,7 @@ export class Source {
     const status = `${this.name}: the server answered ${response.status}`;
     if (response.status >= 500 || response.status === 429) throw new Unreachable(status);
     if (response.status === 416) throw this.changed();
-    throw new Problem(`${status} for ${this.url}`);
+    throw new UserError(`${status} for ${this.url}`);
   }
 
   /**
@@ -87,7 +87,7 @@ export class Source {
     const range = /^bytes (\d+)-(\d+)\/(\d+)$/.exec(response.headers.get("Content-Range") ?? "");
     if (range === null) {
       const expected = "expected a range of bytes with the file's size";
-      throw new Problem(`${this.name}: ${expected} from the server, got none; see its settings`);
+      throw new UserError(`${this.name}: ${expected} from the server, got none; see its settings`);
     }
     const [, begin, , size] = range.map(Number);
     this.checkVersion(response, size);
@@ -107,7 +107,7 @@ export class Source {
       await response.body?.cancel();
       const limit = `${MOST_WHOLE_BYTES / 2 ** 20} MiB`;
       const problem = `the server has no byte ranges, and the file is larger than ${limit}`;
-      throw new Problem(`${this.name}: ${problem}; use a server with ranges`);
+      throw new UserError(`${this.name}: ${problem}; use a server with ranges`);
     }
     const bytes = await this.bytesOf(response);
     this.checkVersion(response, bytes.length);
@@ -128,7 +128,7 @@ export class Source {
   }
 
   changed() {
-    return new Problem(`${this.name}: the file has changed on the server; reload the page`);
+    return new UserError(`${this.name}: the file has changed on the server; reload the page`);
   }
 
   lost() {

@@ -82,6 +82,11 @@ export class Viewer extends EventTarget {
 
   async startRenderer() {
     this.renderer = await Renderer.create(this.canvas, this.settings.poolBytes);
+    this.renderer.onGrown = () => this.invalidate();
+    this.renderer.onLimit = (numPairs) => {
+      const problem = `the picture needs ${numPairs} pairs of gaussians and tiles`;
+      this.emit("notice", { text: `scene: ${problem}; lower the budget or the picture's size` });
+    };
     this.renderer.device.lost.then(() => this.recover());
   }
 

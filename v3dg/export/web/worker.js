@@ -6,7 +6,7 @@ import { Bundle, Core, Scene } from "./core.js";
 import { layOut } from "./layout.js";
 import { ARRIVAL_FRAMES, PagePool } from "./page_pool.js";
 import { readScene } from "./scene_file.js";
-import { Problem, Source, Unreachable } from "./source.js";
+import { UserError, Source, Unreachable } from "./source.js";
 
 /** @typedef {import("./page_pool.js").Wanted} Wanted */
 /** @typedef {import("./placement.js").Instances} Instances */
@@ -128,7 +128,7 @@ class World {
     const selection = this.select();
     const cut = layOut(selection, this.files, this.pool.places, this.instances);
     this.wanted = this.bundles.flatMap((bundle, k) =>
-      this.pool.note(k, bundle.takeNeeds(), this.frame),
+      this.pool.recordNeeds(k, bundle.takeNeeds(), this.frame),
     );
     this.wanted.sort((a, b) => b.priority - a.priority);
     this.read();
@@ -263,7 +263,7 @@ async function retrying(read) {
 
 /** @param {unknown} error */
 function report(error) {
-  if (error instanceof Problem) {
+  if (error instanceof UserError) {
     postMessage({ type: "notice", text: error.message });
     return;
   }
@@ -287,7 +287,7 @@ async function openFiles(urls, instances, module) {
         await retrying(() => file.readRoot(core));
         return file;
       } catch (error) {
-        if (!(error instanceof Problem)) throw error;
+        if (!(error instanceof UserError)) throw error;
         report(error);
         return null;
       }
@@ -327,7 +327,7 @@ let world = null;
  */
 async function openWorld(url, poolBytes) {
   const response = await fetch(new URL("core.wasm", import.meta.url));
-  if (!response.ok) throw new Problem(`core.wasm: the server answered ${response.status}`);
+  if (!response.ok) throw new UserError(`core.wasm: the server answered ${response.status}`);
   const module = await WebAssembly.compile(await response.arrayBuffer());
   const { urls, instances: all, cameras, up } = await readScene(url);
   const { files, instances } = await openFiles(urls, all, module);

@@ -1,0 +1,1 @@
+"""Drawing with WebGPU: the shaders of web pages, run by the package wgpu."""
