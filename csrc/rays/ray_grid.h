@@ -95,8 +95,15 @@ struct RayDirections {
         const float start = box.azimuth0 - turns - kDirectionMargin;
         const float end = box.azimuth1 - turns + kDirectionMargin;
         range.column0 = azimuth.first_from(start);
-        range.column1 =
-            end < kTurn ? azimuth.last_up_to(end) : num_columns() + azimuth.last_up_to(end - kTurn);
+        if (end < kTurn) {
+            range.column1 = azimuth.last_up_to(end);
+            return range;
+        }
+        range.column1 = num_columns() + azimuth.last_up_to(end - kTurn);
+        if (range.column0 == num_columns()) {
+            range.column0 = 0;
+            range.column1 -= num_columns();
+        }
         const int last = range.column0 + num_columns() - 1;
         if (range.column1 > last) range.column1 = last;
         return range;
