@@ -25,7 +25,7 @@ namespace {
 
 // Number of hits in the window of a ray. More need fewer passes, but leave room for
 // fewer warps.
-constexpr unsigned kWindow = 16;
+constexpr unsigned kWindow = 24;
 // Number of entries in a batch: one per lane.
 constexpr unsigned kBatch = 32;
 // The vectors of a record that are copied to shared memory: all in front of the range.
