@@ -438,6 +438,7 @@ class RayFrame:
         sensor: RaySensor,
         viewmats: Array,
         rule: Rule,
+        environments: Array | None = None,
         returns: tuple[float, float] | None = None,
     ) -> Cast: ...
     def cast_model(

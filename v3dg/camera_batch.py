@@ -97,7 +97,7 @@ class CameraBatch:
                 f"viewmats {self.viewmats[number].tolist()}, K {lenses[number].tolist()}"
             )
         if environments is not None:
-            self.environments = _environments(environments, count)
+            self.environments = environment_numbers(environments, "environments", count)
             self.environments.flags.writeable = False
         self.viewmats.flags.writeable = False
         self.K.flags.writeable = False
@@ -119,7 +119,8 @@ class CameraBatch:
         if environments is None:
             return
         if not _is_on_device(environments):
-            environments = torch.as_tensor(_environments(environments, count), device=device)
+            numbers = environment_numbers(environments, "environments", count)
+            environments = torch.as_tensor(numbers, device=device)
         tensor = _tensor(environments, "environments", _WHOLE, [(count,)])
         check("environments", tensor.device == device, f"a tensor on {device}, got {tensor.device}")
         self.environments = tensor
@@ -250,18 +251,19 @@ def _with_any_values(values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64
     return np.array(array, np.float64, order="C")
 
 
-def _environments(values: npt.ArrayLike, count: int) -> npt.NDArray[np.int32]:
-    """Return a copy of environments on the host."""
+def environment_numbers(values: npt.ArrayLike, name: str, count: int) -> npt.NDArray[np.int32]:
+    """Return (count,) a copy of the environments of cameras on the host; ValueError for
+    other values than whole numbers from -1 on."""
     if hasattr(values, "detach"):
         values = cast("Array", values).numpy(force=True)
     array = np.asarray(values)
     fits = array.dtype.kind in "iu" and array.shape == (count,)
     expected = f"{count} whole numbers, one for each camera"
-    check("environments", fits, f"{expected}, got {array.dtype} of shape {array.shape}")
+    check(name, fits, f"{expected}, got {array.dtype} of shape {array.shape}")
     wrong = (array < -1) | (array > MOST_INT)
     if wrong.any():
         number = int(np.argmax(wrong))
-        raise ValueError(f"environments[{number}]: expected -1 or more, got {array[number]}")
+        raise ValueError(f"{name}[{number}]: expected -1 or more, got {array[number]}")
     return array.astype(np.int32)
 
 

@@ -7,13 +7,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias, cast, overload
 
 import numpy as np
+import numpy.typing as npt
 
 from v3dg import _device
 from v3dg._device import CPU
 from v3dg._numbers import Floats, check, check_type, doubles
+from v3dg.camera_batch import environment_numbers
 from v3dg.opening import File, opened
 from v3dg.render.rays import cast_rays
 from v3dg.render.request import CutRequest
+from v3dg.scene import Scene
 from v3dg.spherical import Lidar, checked_pose
 
 if TYPE_CHECKING:
@@ -134,6 +137,7 @@ def scan(
     lidar: Lidar,
     pose: MatrixLike,
     *,
+    environment: Array | npt.ArrayLike | None = None,
     tolerance: float | None = None,
     min_level: int = 0,
     device: str | Device = "auto",
@@ -144,6 +148,7 @@ def scan(
     lidar: Lidar,
     pose: Sequence[MatrixLike],
     *,
+    environment: Array | npt.ArrayLike | None = None,
     tolerance: float | None = None,
     min_level: int = 0,
     device: str | Device = "auto",
@@ -153,6 +158,7 @@ def scan(
     lidar: Lidar,
     pose: _Poses,
     *,
+    environment: Array | npt.ArrayLike | None = None,
     tolerance: float | None = None,
     min_level: int = 0,
     device: str | Device = "auto",
@@ -174,6 +180,11 @@ def scan(
             The sensor has x forward (azimuth 0), y left and z up. A float32 or float64
             torch tensor on the CUDA device that scans stays there and is not checked.
             If such a pose is not a rigid motion, its rays hit nothing.
+        environment: The environment of the sensor (see `Scene.environments`), or (B,)
+            of the sensors. A sensor sees the instances of its environment and the
+            shared ones, for -1 only the shared ones. None: it sees all instances. An
+            int32 or int64 tensor on the CUDA device stays there and is not checked. If
+            the scene does not have such an environment, its rays hit nothing.
         tolerance, min_level: As in `v3dg.select`, with `Lidar.spacing` as the size of a
             pixel.
         device: As in `v3dg.render`.
@@ -188,19 +199,46 @@ def scan(
     content: Subject = opened(subject)
     cut = CutRequest(tolerance=tolerance, min_level=min_level)
     poses, is_one = _poses_of(pose, chosen_device)
-    returns = lidar.detection, lidar.gap
-    viewmats = _viewmats(poses)
-    size = max(1, len(poses))
-    if not chosen_device.is_cuda:
-        size = 1  # one pose at a time, so that the program can be interrupted
-    casts = [
-        cast_rays(content, lidar.core, viewmats[first : first + size], cut, chosen_device, returns)
-        for first in range(0, max(1, len(poses)), size)
-    ]
+    environments = _environments_of(environment, content, len(poses), chosen_device)
+    casts = _cast_parts(content, lidar, _viewmats(poses), environments, cut, chosen_device)
     batch = ScanBatch(lidar, poses, casts)
     if is_one:
         return batch[0]
     return batch
+
+
+def _cast_parts(
+    subject: Subject,
+    lidar: Lidar,
+    viewmats: Array,
+    environments: Array | None,
+    cut: CutRequest,
+    device: Device,
+) -> list[Cast]:
+    """Return the casts of all poses: on the CPU one for each pose, so that the program
+    can be interrupted between them."""
+    count = max(1, len(viewmats))
+    size = count
+    if not device.is_cuda:
+        size = 1
+    casts = []
+    for first in range(0, count, size):
+        part = slice(first, first + size)
+        environments_of_part = None
+        if environments is not None:
+            environments_of_part = environments[part]
+        casts.append(
+            cast_rays(
+                subject,
+                lidar.core,
+                viewmats[part],
+                cut,
+                device,
+                environments=environments_of_part,
+                returns=(lidar.detection, lidar.gap),
+            )
+        )
+    return casts
 
 
 def _poses_of(pose: _Poses, device: Device) -> tuple[Array, bool]:
@@ -222,6 +260,44 @@ def _poses_of(pose: _Poses, device: Device) -> tuple[Array, bool]:
     expected = f"a tensor on {device}, which scans, got one on {of_tensor}"
     check("pose", of_tensor == device and device != CPU, expected)
     return tensor.reshape(-1, 4, 4), len(shape) == 2
+
+
+def _environments_of(
+    environment: Array | npt.ArrayLike | None, subject: Subject, count: int, device: Device
+) -> Array | None:
+    """Return (count,) the environments of sensors on the device."""
+    if environment is None:
+        return None
+    if not getattr(environment, "is_cuda", False):
+        values = np.asarray(environment)
+        if values.ndim == 0:
+            values = np.full(count, values)
+        numbers = environment_numbers(values, "environment", count)
+        _check_environments(numbers, subject)
+        if not device.is_cuda:
+            return numbers
+        import torch
+
+        return torch.as_tensor(numbers, device=str(device))
+    tensor = cast("Array", environment).detach()
+    expected = f"shape () or ({count},), got {tuple(tensor.shape)}"
+    check("environment", tuple(tensor.shape) in ((), (count,)), expected)
+    expected = f"int32 or int64, got {tensor.dtype}"
+    check("environment", str(tensor.dtype) in ("torch.int32", "torch.int64"), expected)
+    of_tensor = _device.of(tensor)
+    expected = f"a tensor on {device}, which scans, got one on {of_tensor}"
+    check("environment", of_tensor == device and device != CPU, expected)
+    return tensor.expand(count).contiguous()
+
+
+def _check_environments(numbers: npt.NDArray[np.int32], subject: Subject) -> None:
+    """Raise ValueError for an environment that the subject does not have."""
+    last = -1
+    if isinstance(subject, Scene) and len(subject.environments):
+        last = int(subject.environments.max())
+    for number, value in enumerate(numbers.tolist()):
+        expected = f"-1 to {last}, as the scene has, got {value}"
+        check(f"environment[{number}]", value <= last, expected)
 
 
 def _joined(planes: list[Array]) -> Array:

@@ -11,6 +11,7 @@
 #include "bindings/sensor.h"
 #include "bindings/types.h"
 #include "frame/image.h"
+#include "residency/environments.h"
 
 namespace v3dg {
 
@@ -22,6 +23,20 @@ struct Reals {
 
 // Borrows an array of float64 or, on a device, of float32.
 Reals reals_of(Device device, const py::object& array, const char* name, const Shape& shape);
+
+// A borrowed array of int32 or int64; null where it is missing.
+struct Wholes {
+    const void* data;
+    bool are_long;
+};
+
+// Borrows an array of int32 or, on a device, of int64, or None.
+Wholes wholes_of(Device device, const py::object& array, const char* name, const Shape& shape);
+
+// Throws ValueError if a camera or a sensor has an environment that the scene does not
+// have. Does nothing for arrays on a device.
+void check_environments(Device device, const Wholes& environments, size_t count,
+                        const EnvironmentTable& table, const char* name);
 
 // B cameras of one size. The arrays are on the host or on one device. They are read
 // when a batch is drawn, so they may change in place between batches.
@@ -42,9 +57,8 @@ class BoundCameras {
     const Reals& viewmats() const { return viewmats_; }
     const Reals& intrinsics() const { return intrinsics_; }
     bool shares_intrinsics() const { return shares_intrinsics_; }
-    // Environments as int32 or int64; null if the cameras see all instances.
-    const void* environments() const { return environments_; }
-    bool are_environments_long() const { return are_environments_long_; }
+    // Null if the cameras see all instances.
+    const Wholes& environments() const { return environments_; }
     // The cameras if some have lens distortion; otherwise empty.
     const std::vector<Camera>& lenses() const { return lenses_; }
     // Returns the cameras. Their arrays must be on the host.
@@ -57,8 +71,8 @@ class BoundCameras {
     int width_, height_;
     double near_depth_;
     Reals viewmats_{}, intrinsics_{};
-    bool shares_intrinsics_ = false, are_environments_long_ = false;
-    const void* environments_ = nullptr;
+    bool shares_intrinsics_ = false;
+    Wholes environments_{};
     std::vector<Camera> lenses_;
 };
 

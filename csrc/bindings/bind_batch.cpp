@@ -46,6 +46,24 @@ Reals reals_of(Device device, const py::object& array, const char* name, const S
     return {.data = span_on<const double>(device, array, name, shape).data, .are_double = true};
 }
 
+Wholes wholes_of(Device device, const py::object& array, const char* name, const Shape& shape) {
+    if (array.is_none()) return {};
+    if (device != kHost && has_dtype(array, "int64"))
+        return {.data = span_on<const int64_t>(device, array, name, shape).data, .are_long = true};
+    return {.data = span_on<const int32_t>(device, array, name, shape).data, .are_long = false};
+}
+
+void check_environments(Device device, const Wholes& environments, size_t count,
+                        const EnvironmentTable& table, const char* name) {
+    if (device != kHost || environments.data == nullptr) return;
+    const auto* environment = static_cast<const int32_t*>(environments.data);
+    for (size_t b = 0; b < count; ++b)
+        if (environment[b] < kShared || environment[b] >= table.num_environments())
+            throw py::value_error(name + ("[" + std::to_string(b)) + "]: expected -1 to " +
+                                  std::to_string(table.num_environments() - 1) +
+                                  ", as the scene has, got " + std::to_string(environment[b]));
+}
+
 BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int height, double near,
                            py::object environments,
                            const std::optional<std::vector<BoundCamera>>& lenses)
@@ -73,14 +91,7 @@ BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int hei
         if (!fits) refuse_value("lenses", "expected one camera of this size for each pose");
         for (const BoundCamera& camera : *lenses) lenses_.push_back(camera.camera);
     }
-    if (environments_object_.is_none()) return;
-    are_environments_long_ = device_ != kHost && has_dtype(environments_object_, "int64");
-    if (are_environments_long_)
-        environments_ =
-            span_on<const int64_t>(device_, environments_object_, "environments", {count}).data;
-    else
-        environments_ =
-            span_on<const int32_t>(device_, environments_object_, "environments", {count}).data;
+    environments_ = wholes_of(device_, environments_object_, "environments", {count});
 }
 
 std::vector<Camera> BoundCameras::on_host() const {

@@ -212,7 +212,8 @@ class BoundSceneFrame {
             throw py::value_error(
                 "budget: a batch has no budget; leave it out, or draw the cameras one by one");
         const std::shared_ptr<const SceneState> state = scene.state();
-        check_environments(cameras, state->environments->table());
+        check_environments(device_, cameras.environments(), cameras.size(),
+                           state->environments->table(), "environments");
         std::optional<BoundPlanes> new_planes;
         if (planes == nullptr) planes = &new_planes.emplace(cameras, device_, shade.with_depth);
         planes->check(cameras, device_);
@@ -270,18 +271,6 @@ class BoundSceneFrame {
         for (const Camera& camera : cameras.lenses()) check_clipped(request, camera);
         return {.planes = channels.allocate(device_, request.channels, shape, planes),
                 .mesh = request.mesh};
-    }
-
-    // Throws ValueError if a camera on the host has an environment that the scene does
-    // not have.
-    static void check_environments(const BoundCameras& cameras, const EnvironmentTable& table) {
-        if (cameras.device() != kHost || cameras.environments() == nullptr) return;
-        const auto* environment = static_cast<const int32_t*>(cameras.environments());
-        for (size_t b = 0; b < cameras.size(); ++b)
-            if (environment[b] < kShared || environment[b] >= table.num_environments())
-                throw py::value_error("environments[" + std::to_string(b) + "]: expected -1 to " +
-                                      std::to_string(table.num_environments() - 1) +
-                                      ", as the scene has, got " + std::to_string(environment[b]));
     }
 
     // Checks that the scene, the request and the pool fit each other, then calls

@@ -98,7 +98,7 @@ class BoundRayFrame {
 
     BoundCast cast_scene(const BoundScene& scene, const RaySensor& sensor,
                          const py::object& viewmats, const SelectRule& rule,
-                         const GivenRule& returns) const {
+                         const py::object& environments, const GivenRule& returns) const {
         check_device(scene.device(), "scene");
         if (rule.budget != kNoBudget)
             throw py::value_error("budget: expected none for rays, got one; leave it out");
@@ -111,7 +111,8 @@ class BoundRayFrame {
         const auto run = [&](const backend::CastInput& input, const Work& work) {
             return frame_->cast_scene(scene.handle(), *state, input, work);
         };
-        return cast(sensor, viewmats, rule, returns, run);
+        return cast(sensor, viewmats, environments, state->environments->table(), rule, returns,
+                    run);
     }
 
     BoundCast cast_model(const BoundModel& model, const RaySensor& sensor,
@@ -125,23 +126,27 @@ class BoundRayFrame {
         const auto run = [&](const backend::CastInput& input, const Work& work) {
             return frame_->cast_model(*model.handle(), appearance, input, work);
         };
-        return cast(sensor, viewmats, {}, returns, run);
+        return cast(sensor, viewmats, py::none(), {}, {}, returns, run);
     }
 
   private:
     // Makes the planes, and calls run(input, work) without the GIL.
     template <class Run>
-    BoundCast cast(const RaySensor& sensor, const py::object& viewmats, const SelectRule& rule,
-                   const GivenRule& returns, const Run& run) const {
+    BoundCast cast(const RaySensor& sensor, const py::object& viewmats,
+                   const py::object& environments, const EnvironmentTable& table,
+                   const SelectRule& rule, const GivenRule& returns, const Run& run) const {
         check_device(device_of(viewmats, "viewmats"), "viewmats");
         const Reals matrices = reals_of(device_, viewmats, "viewmats", {-1, 4, 4});
         const py::ssize_t count = shape_of(viewmats, "viewmats")[0];
+        const Wholes of_sensors = wholes_of(device_, environments, "environment", {count});
+        check_environments(device_, of_sensors, static_cast<size_t>(count), table, "environment");
         const Work work(device_);
         BoundCast made;
         const backend::CastInput input{
             .sensor = sensor,
             .viewmats = matrices,
             .num_poses = static_cast<size_t>(count),
+            .environments = of_sensors,
             .rule = rule,
             .planes = make_planes(device_, count, *sensor.grid, returns, made)};
         const Unlocked unlocked;
@@ -191,9 +196,10 @@ void bind_rays(py::module_& m) {
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundRayFrame::set_models, "models"_a)
         .def("cast_scene", &BoundRayFrame::cast_scene, "scene"_a, "sensor"_a, "viewmats"_a,
-             "rule"_a, "returns"_a = py::none(),
+             "rule"_a, "environments"_a = py::none(), "returns"_a = py::none(),
              "Casts the rays of a sensor through the cut of a scene at each pose. `viewmats` are "
-             "(B, 4, 4) from the world to the sensor. With `returns`, the least weight of a return "
+             "(B, 4, 4) from the world to the sensor. `environments` are (B,), or None for sensors "
+             "that see all instances. With `returns`, the least weight of a return "
              "and the gap behind it, the result has returns, otherwise colour and range.")
         .def("cast_model", &BoundRayFrame::cast_model, "model"_a, "sensor"_a, "viewmats"_a,
              py::kw_only(), "filter_px2"_a, "antialiased"_a, "returns"_a = py::none(),

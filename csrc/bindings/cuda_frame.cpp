@@ -232,11 +232,11 @@ class EnqueuedBatch final : public BoundBatch {
 CameraArrays arrays_of(const BoundCameras& cameras) {
     return {.viewmats = cameras.viewmats().data,
             .intrinsics = cameras.intrinsics().data,
-            .environments = cameras.environments(),
+            .environments = cameras.environments().data,
             .are_viewmats_double = cameras.viewmats().are_double,
             .are_intrinsics_double = cameras.intrinsics().are_double,
             .shares_intrinsics = cameras.shares_intrinsics(),
-            .are_environments_long = cameras.are_environments_long(),
+            .are_environments_long = cameras.environments().are_long,
             .width = cameras.width(),
             .height = cameras.height(),
             .near_depth = cameras.near_depth()};

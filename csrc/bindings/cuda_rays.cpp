@@ -11,6 +11,8 @@ namespace {
 RayPoses poses_of(const backend::CastInput& input) {
     return {.viewmats = input.viewmats.data,
             .are_double = input.viewmats.are_double,
+            .environments = input.environments.data,
+            .are_environments_long = input.environments.are_long,
             .count = static_cast<uint32_t>(input.num_poses)};
 }
 

@@ -234,7 +234,7 @@ class HostFrame final : public backend::Frame {
             const Unlocked unlocked;
             const std::vector<Camera> camera = cameras.on_host();
             std::vector<int32_t> environment(cameras.size(), kSeesAll);
-            const auto* given = static_cast<const int32_t*>(cameras.environments());
+            const auto* given = static_cast<const int32_t*>(cameras.environments().data);
             if (given != nullptr) environment.assign(given, given + cameras.size());
             cpu::draw_batch(HostScene{.tables = {state.tables.data(), state.tables.size()},
                                       .models = {models.data(), models.size()},

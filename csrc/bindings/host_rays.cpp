@@ -3,6 +3,7 @@
 #include "bindings/host_frame.h"
 #include "bindings/rays.h"
 #include "camera/camera_arrays.h"
+#include "draw/seen_instances.h"
 
 namespace v3dg::host {
 
@@ -37,9 +38,16 @@ class HostRayFrame final : public backend::RayFrame {
                                     .models = {drawn.data(), drawn.size()},
                                     .instances = state.instances};
         std::vector<int64_t> gaussians;
-        for (size_t pose = 0; pose < input.num_poses; ++pose)
-            gaussians.push_back(cpu::cast_scene(scene, input.sensor, camera_at(input, pose),
-                                                input.rule, planes_at(input, pose)));
+        const auto* environments = static_cast<const int32_t*>(input.environments.data);
+        for (size_t pose = 0; pose < input.num_poses; ++pose) {
+            if (environments == nullptr) {
+                gaussians.push_back(cast_at(scene, input, pose));
+                continue;
+            }
+            const SeenInstances seen(state.instances, state.environments->table(),
+                                     environments[pose]);
+            gaussians.push_back(cast_at(seen.part_of(scene), input, pose));
+        }
         return gaussians;
     }
 
@@ -60,6 +68,11 @@ class HostRayFrame final : public backend::RayFrame {
     }
 
   private:
+    static int64_t cast_at(const v3dg::HostScene& scene, const backend::CastInput& input,
+                           size_t pose) {
+        return cpu::cast_scene(scene, input.sensor, camera_at(input, pose), input.rule,
+                               planes_at(input, pose));
+    }
     static RayPlanes planes_at(const backend::CastInput& input, size_t pose) {
         return input.planes.from(pose * input.sensor.grid->directions().num_rays());
     }

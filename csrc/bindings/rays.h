@@ -16,6 +16,8 @@ struct CastInput {
     const RaySensor& sensor;
     Reals viewmats;  // (B, 4, 4) from the world to the sensor
     size_t num_poses;
+    // (B,) int32 on the host; null if the sensors see all instances
+    Wholes environments;
     SelectRule rule;  // without a budget; not used for an asset
     // The planes of all poses follow each other.
     RayPlanes planes;

@@ -15,9 +15,9 @@ namespace cuda {
 namespace {
 
 // Limits of a part, which bound its memory; a record has 128 bytes. With at most
-// kMostTiles tiles, keys of entries have at least 16 bits for distances.
+// kMostTiles tiles, entries have at least 15 bits for distances.
 constexpr size_t kMostGaussians = size_t(1) << 23;
-constexpr size_t kMostTiles = size_t(1) << 15;
+constexpr size_t kMostTiles = size_t(1) << 16;
 constexpr uint32_t kMostPoses = 256;
 // Indices of entries have 32 bits.
 constexpr unsigned long long kMostEntries = (1ull << 32) - 2;
@@ -51,6 +51,20 @@ __global__ void asset_items_kernel(BatchViews views, uint32_t num_gaussians, uin
                       .sharers = 0,
                       .cluster = 0,
                       .weight = 1};
+}
+
+// Returns the mean angle between neighbours, or a large one if there is only one angle.
+float step_of(const AngleTable& table) {
+    if (table.size < 2) return kTurn;
+    return (table.angles[table.size - 1] - table.angles[0]) / static_cast<float>(table.size - 1);
+}
+
+// Sets the tiles of a warp: 8 x 4 rays, or 16 x 2 if the former are higher than wide.
+void set_tile_size(const RayGrid& grid, RayDirections& rays) {
+    const RayDirections& on_host = grid.directions();
+    const bool is_high = 4 * step_of(on_host.elevation) > 8 * step_of(on_host.azimuth);
+    rays.tile_width = is_high ? 16 : 8;
+    rays.tile_height = kRaysOfTile / rays.tile_width;
 }
 
 }  // namespace
@@ -87,6 +101,7 @@ const RayDirections& DeviceRayGrid::load(const std::shared_ptr<const RayGrid>& g
     directions_.elevation_sine = take_floats(elevation.sine);
     directions_.elevation.first_in_bucket = take_ints(elevation.first_in_bucket);
     directions_.row_place = take_ints(elevation.place);
+    set_tile_size(*grid, directions_);
     grid_ = grid;
     return directions_;
 }
@@ -147,18 +162,18 @@ std::vector<int64_t> RayFrame::cast(const Subject& subject, const RaySensor& sen
                                     cudaStream_t stream) {
     refuse_capture(stream);
     const StreamLock lock(busy_, stream);
-    const size_t num_tiles = sensor.grid->directions().num_tiles();
+    const size_t num_tiles = grid_.load(sensor.grid, stream).num_tiles();
     if (num_tiles > kMostRayTiles)
-        throw std::length_error("rays: expected at most 2147483520 on a CUDA device, got more");
+        throw std::length_error("rays: expected at most 8589934560 on a CUDA device, got more");
     const double focal = 1.0 / sensor.limits.spacing;
     const double K[9] = {focal, 0, 0, 0, focal, 0, 0, 0, 1};
     const CameraArrays arrays{.viewmats = poses.viewmats,
                               .intrinsics = intrinsics_.copy_from({K, 9}, stream),
-                              .environments = nullptr,
+                              .environments = poses.environments,
                               .are_viewmats_double = poses.are_double,
                               .are_intrinsics_double = true,
                               .shares_intrinsics = true,
-                              .are_environments_long = false,
+                              .are_environments_long = poses.are_environments_long,
                               .width = 1,
                               .height = 1,
                               .near_depth = sensor.limits.nearest};
@@ -234,7 +249,10 @@ std::vector<int64_t> RayFrame::cast_part(const Subject& subject, const RaySensor
                                          const RayPlanes& planes, cudaStream_t stream) {
     const RayDirections& rays = grid_.load(sensor.grid, stream);
     const bool is_scene = subject.scene != nullptr;
-    const SeenBounds seen = is_scene ? subject.scene->seen_by_all() : SeenBounds{1, 1};
+    SeenBounds seen{1, 1};
+    if (is_scene)
+        seen = poses.environments == nullptr ? subject.scene->seen_by_all()
+                                             : subject.scene->seen_in_environment();
     const size_t num_slots = is_scene ? batch_slots(seen.instances) : 1;
     const size_t num_zeros = Cut::num_batch_zeros(num_slots * count);
     const size_t num_before = sizeof(Counts) + num_zeros * sizeof(unsigned long long);

@@ -11,11 +11,14 @@
 namespace v3dg {
 namespace cuda {
 
-// Poses on the device: (B, 4, 4) from the world to the sensor. At a pose that is no
-// rigid motion, the sensor sees nothing.
+// Poses on the device: (B, 4, 4) transforms from the world to the sensor, and the
+// environments that it sees there. If a pose is not a rigid motion, or the scene does
+// not have its environment, its rays hit nothing.
 struct RayPoses {
     const void* viewmats;
     bool are_double;
+    const void* environments;  // (B,); null if the sensors see all instances
+    bool are_environments_long;
     uint32_t count;
 };
 

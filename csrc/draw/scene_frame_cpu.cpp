@@ -12,6 +12,7 @@
 #include "base/parallel_for.h"
 #include "draw/cut_draws.h"
 #include "draw/false_color.h"
+#include "draw/seen_instances.h"
 #include "draw/sense.h"
 #include "math/sh.h"
 
@@ -223,42 +224,6 @@ SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& reque
     return counts;
 }
 
-// The instances of a scene that one camera sees, in the order of their slots.
-class SeenInstances {
-  public:
-    SeenInstances(const InstanceTable& all, const EnvironmentTable& environments,
-                  int32_t environment) {
-        const int32_t count = environments.num_slots(environment);
-        for (int32_t slot = 0; slot < count; ++slot) {
-            const auto i = static_cast<size_t>(environments.instance_of(environment, slot));
-            ids_.push_back(static_cast<int32_t>(i));
-            bundle_.push_back(all.bundle[i]);
-            position_.insert(position_.end(), &all.position[3 * i], &all.position[3 * i] + 3);
-            quaternion_.insert(quaternion_.end(), &all.quaternion[4 * i],
-                               &all.quaternion[4 * i] + 4);
-            scale_.push_back(all.scale[i]);
-            importance_.push_back(all.importance[i]);
-            if (!all.factors.empty()) factors_.push_back(all.factors[i]);
-        }
-    }
-    InstanceTable table() const {
-        return {.bundle = {bundle_.data(), bundle_.size()},
-                .position = {position_.data(), position_.size()},
-                .quaternion = {quaternion_.data(), quaternion_.size()},
-                .scale = {scale_.data(), scale_.size()},
-                .importance = {importance_.data(), importance_.size()},
-                .factors = {factors_.data(), factors_.size()}};
-    }
-    // Returns the ids of the instances in the whole scene.
-    Span<const int32_t> ids() const { return {ids_.data(), ids_.size()}; }
-
-  private:
-    std::vector<int32_t> ids_, bundle_;
-    std::vector<double> position_, quaternion_, scale_;
-    std::vector<float> importance_;
-    std::vector<InstanceFactors> factors_;
-};
-
 // Returns the picture of camera k, whose planes are part of those of a batch.
 Picture<float> picture_of(const BatchRequest& request, size_t k) {
     const size_t num_pixels = static_cast<size_t>(request.width) * request.height;
@@ -288,10 +253,7 @@ SceneFrameCounts draw_picture(const HostScene& scene, const BatchRequest& reques
         return draw_selected(scene, one, request.rule, {&picture, 1}, {&sensor, 1}, workspace,
                              nullptr);
     const SeenInstances seen(scene.instances, cameras.environments, environment);
-    HostScene part = scene;
-    part.instances = seen.table();
-    part.instance_ids = seen.ids();
-    return draw_selected(part, one, request.rule, {&picture, 1}, {&sensor, 1}, workspace, nullptr);
+    return draw_selected(seen.part_of(scene), one, request.rule, {&picture, 1}, {&sensor, 1}, workspace, nullptr);
 }
 
 }  // namespace

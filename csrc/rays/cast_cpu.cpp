@@ -155,7 +155,9 @@ RayGrid::RayGrid(Span<const double> azimuth, Span<const double> elevation,
                   .elevation_cosine = elevation_.cosine.data(),
                   .elevation_sine = elevation_.sine.data(),
                   .column_place = azimuth_.place.data(),
-                  .row_place = elevation_.place.data()} {}
+                  .row_place = elevation_.place.data(),
+                  .tile_width = kRayTileColumns,
+                  .tile_height = kRayTileRows} {}
 
 void cpu::cast_rays(const std::vector<Draw<float>>& draws, const RayDirections& rays,
                     const RayLimits& limits, const RayPlanes& planes) {

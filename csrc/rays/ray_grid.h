@@ -10,6 +10,7 @@
 
 namespace v3dg {
 
+// The tiles of the CPU. Tables are padded to whole ones; tiles of a device divide them.
 constexpr int kRayTileColumns = 16, kRayTileRows = 8;
 constexpr int kRayTileSize = kRayTileColumns * kRayTileRows;
 constexpr float kTurn = static_cast<float>(2 * kPi);
@@ -68,13 +69,13 @@ struct RayDirections {
     const float *azimuth_cosine, *azimuth_sine, *elevation_cosine, *elevation_sine;
     // The column and the row of the sensor's picture that each angle belongs to.
     const int32_t *column_place, *row_place;
+    // Columns and rows of a tile.
+    int tile_width, tile_height;
 
     V3DG_HD int num_columns() const { return azimuth.size; }
     V3DG_HD int num_rows() const { return elevation.size; }
-    V3DG_HD int tile_columns() const {
-        return (num_columns() + kRayTileColumns - 1) / kRayTileColumns;
-    }
-    V3DG_HD int tile_rows() const { return (num_rows() + kRayTileRows - 1) / kRayTileRows; }
+    V3DG_HD int tile_columns() const { return (num_columns() + tile_width - 1) / tile_width; }
+    V3DG_HD int tile_rows() const { return (num_rows() + tile_height - 1) / tile_height; }
     V3DG_HD size_t num_tiles() const { return size_t(tile_columns()) * tile_rows(); }
     V3DG_HD size_t num_rays() const { return size_t(num_columns()) * num_rows(); }
 
@@ -94,8 +95,15 @@ struct RayDirections {
         const float start = box.azimuth0 - turns - kDirectionMargin;
         const float end = box.azimuth1 - turns + kDirectionMargin;
         range.column0 = azimuth.first_from(start);
-        range.column1 =
-            end < kTurn ? azimuth.last_up_to(end) : num_columns() + azimuth.last_up_to(end - kTurn);
+        if (end < kTurn) {
+            range.column1 = azimuth.last_up_to(end);
+            return range;
+        }
+        range.column1 = num_columns() + azimuth.last_up_to(end - kTurn);
+        if (range.column0 == num_columns()) {
+            range.column0 = 0;
+            range.column1 -= num_columns();
+        }
         const int last = range.column0 + num_columns() - 1;
         if (range.column1 > last) range.column1 = last;
         return range;
@@ -103,17 +111,17 @@ struct RayDirections {
 
     V3DG_HD RayTiles tiles_of(const RayRange& range) const {
         const int columns = tile_columns();
-        const int row = range.row0 / kRayTileRows;
-        const int column = range.column0 / kRayTileColumns;
-        int last = range.column1 / kRayTileColumns;
+        const int row = range.row0 / tile_height;
+        const int column = range.column0 / tile_width;
+        int last = range.column1 / tile_width;
         // A range that wraps around continues at the first tile, so it may contain that
         // tile twice.
         if (range.column1 >= num_columns())
-            last = columns + (range.column1 - num_columns()) / kRayTileColumns;
+            last = columns + (range.column1 - num_columns()) / tile_width;
         if (last > column + columns - 1) last = column + columns - 1;
         return {.row = row,
                 .column = column,
-                .num_rows = static_cast<uint32_t>(range.row1 / kRayTileRows - row + 1),
+                .num_rows = static_cast<uint32_t>(range.row1 / tile_height - row + 1),
                 .num_columns = static_cast<uint32_t>(last - column + 1)};
     }
     // Returns the index of the k-th tile.
@@ -128,10 +136,10 @@ struct RayDirections {
 // A gaussian that may hit rays, as it is read for blending. It fills two cache lines.
 struct alignas(64) RayRecord {
     RayShape<float> shape;
-    float color[3];
-    float nearest;  // no ray is hit closer than this
-    RayRange range;
     uint32_t order;  // breaks ties of distances; ascends in the order of the draws
+    float nearest;   // no ray is hit closer than this
+    float color[3];
+    alignas(16) RayRange range;
 };
 static_assert(sizeof(RayRecord) == 128, "a record fills two cache lines");
 

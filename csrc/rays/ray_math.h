@@ -238,7 +238,17 @@ V3DG_HD V3DG_INLINE DirectionBox<V> directions_of(const SeenGaussian<V>& seen, c
     return box;
 }
 
-// Returns a lower bound on the distance of all points of the ellipsoid q <= reach2.
+// Returns a lower bound on the distances of the largest values on all rays with
+// q <= reach2.
+//
+// Let x = p + y be such a place, S the covariance, u the direction of the mean, and let
+// lengths be divided by |p|. The value is stationary along the ray, so x^T S^-1 y = 0,
+// which means u^T S^-1 y = -q. Split S^1/2 u into its part along S^-1/2 u and the rest
+// a. With v = 1 / (u^T S^-1 u), |a|² = u^T S u - v, and
+//   u . y >= -q v - |a| sqrt(q).
+// The distance of x is at least u . x = 1 + u . y. For a round gaussian, a is 0: all of
+// its places are about as far away as its mean. The nearest point of the ellipsoid is a
+// second bound.
 template <class V>
 V3DG_HD V3DG_INLINE V nearest_of(const SeenGaussian<V>& seen, const V& reach2) {
     using T = Lane<V>;
@@ -247,7 +257,12 @@ V3DG_HD V3DG_INLINE V nearest_of(const SeenGaussian<V>& seen, const V& reach2) {
         const V along = seen.sigma[k] * dot3(seen.axis[k], seen.direction);
         uu += along * along;
     }
-    const V share = T(1 - 1e-5) - sqrt_of(reach2 * uu) * T(1 + 1e-5);
+    const V volume = seen.sigma[0] * seen.sigma[1] * seen.sigma[2];
+    const V depth = volume / sqrt_of(seen.determinant);
+    const V depth2 = min_of(depth * depth, uu);  // v
+    const V across2 = uu - depth2 + T(1e-5) * uu;
+    const V spread = min_of(reach2 * depth2 + sqrt_of(reach2 * across2), sqrt_of(reach2 * uu));
+    const V share = T(1 - 1e-5) - spread * T(1 + 1e-5);
     return max_of(share, V{}) * seen.distance;
 }
 

@@ -82,10 +82,10 @@ static void project_rows(const Source& from, const Draw<float>& draw, uint64_t f
         for (; kept != 0; kept &= kept - 1) {
             const int i = __builtin_ctz(kept);
             records.push_back({.shape = lane_of(shape, i),
-                               .color = {color[0][i], color[1][i], color[2][i]},
+                               .order = 0,
                                .nearest = nearest[i],
-                               .range = range[i],
-                               .order = 0});
+                               .color = {color[0][i], color[1][i], color[2][i]},
+                               .range = range[i]});
         }
     }
 }
@@ -163,9 +163,11 @@ static V3DG_INLINE void hit_row(const RayRecord& record, uint32_t index, const R
         const V log2_alpha =
             max_of(record.shape.log2_opacity - hit.falloff, all_lanes<V>(float(kLog2MinAlpha - 1)));
         const V alpha = min_of(exp2_in_range(log2_alpha), all_lanes<V>(float(kMaxAlpha)));
+        // Rounding must not put a hit in front of the bound that orders the entries.
+        const V range = max_of(hit.range, all_lanes<V>(record.nearest));
         for (; bits != 0; bits &= bits - 1) {
             const int i = __builtin_ctz(bits), ray = first_ray + c + i;
-            if (rays.is_open(ray)) scratch.pending[ray].push_back({hit.range[i], alpha[i], index});
+            if (rays.is_open(ray)) scratch.pending[ray].push_back({range[i], alpha[i], index});
         }
     }
 }

@@ -1,17 +1,11 @@
-// Casts rays on CUDA.
+// Projects gaussians to rays on CUDA, and sorts them into tiles. cast_rays_cuda.cu
+// blends them.
 //
 // A warp projects an item; each lane projects one gaussian of one placement. Atomic
 // counters append records and entries to lists, so their order in memory varies from
 // run to run. The results do not depend on this order: entries are sorted by tile and
 // distance, the hits of a ray by distance, and hits of equal distance in the order of
 // the draws.
-//
-// A block blends a tile, with one thread per ray. It reads the entries of its tile in
-// ascending order of their smallest distances. Each ray has a window that stores its
-// nearest hits that are not yet blended. A hit is blended as soon as no later entry can
-// have a closer hit. If the window is full, the farthest hit is dropped, and the ray is
-// only blended up to that hit; another pass over the entries continues from there. So
-// the order of hits is exact, although memory is bounded.
 
 #include "rays/rays_cuda.h"
 
@@ -22,6 +16,8 @@
 #include "base/launch.cuh"
 #include "base/scan.cuh"
 #include "project/sources.cuh"
+#include "rays/ray_entry.h"
+#include "rays/tile_bound.h"
 
 namespace v3dg {
 namespace cuda {
@@ -33,39 +29,6 @@ constexpr unsigned kProjectBlocks = 4;  // resident blocks per multiprocessor
 // A lane writes the entries of a record with at most this many tiles. The lanes of the
 // warp share the work for larger records.
 constexpr uint32_t kFewTiles = 16;
-// Distances are coded relative to the smallest distance. A code consists of six bits of
-// the exponent and the whole mantissa of a float.
-constexpr unsigned kDistanceBits = 29;
-constexpr uint32_t kMostDistance = (1u << kDistanceBits) - 1;
-
-// Number of hits in the window of a ray; a power of two.
-constexpr unsigned kWindow = 16;
-// Number of entries that a block loads at once, one per lane of a warp.
-constexpr unsigned kLoaded = 32;
-// Size of the block of rays, within a tile, that a warp blends.
-constexpr int kWarpColumns = 8, kWarpRows = 4;
-static_assert(kWarpColumns * kWarpRows == 32 && kRayTileColumns % kWarpColumns == 0 &&
-                  kRayTileRows % kWarpRows == 0,
-              "warps divide a tile into rectangles");
-
-// Returns the code of a distance in `bits` bits. Larger distances never have smaller
-// codes.
-V3DG_HD uint32_t code_of_distance(float distance, float nearest, unsigned bits) {
-    const float x = distance > nearest ? distance : nearest;
-    uint32_t of_x, of_nearest;
-    std::memcpy(&of_x, &x, sizeof x);
-    std::memcpy(&of_nearest, &nearest, sizeof nearest);
-    const uint32_t difference = of_x - of_nearest;
-    return (difference < kMostDistance ? difference : kMostDistance) >> (kDistanceBits - bits);
-}
-
-// Returns a lower bound of all distances whose code is at least `code`.
-V3DG_HD float distance_of_code(uint32_t code, float nearest, unsigned bits) {
-    uint32_t of_nearest;
-    std::memcpy(&of_nearest, &nearest, sizeof nearest);
-    return float_of_bits(of_nearest + (code << (kDistanceBits - bits)));
-}
-
 // Loads gaussians that are stored as rows of floats.
 struct RowReader {
     using Model = GaussianRows<const float>;
@@ -149,17 +112,22 @@ __device__ RayListCounts add_to(RayListCounts* counts, uint32_t records, uint32_
 // Writes the entries of the lanes' records. `before` is the number of entries of lower
 // lanes. All lanes of the warp must call it; a lane without a record passes an empty
 // range of tiles.
-__device__ void write_entries(const RayDirections& rays, const RayTiles& tiles, uint32_t num_tiles,
-                              uint32_t first_tile, uint32_t distance, uint32_t record,
-                              unsigned long long first, uint32_t before, const RayLists& out) {
-    const auto write = [&](const RayTiles& reached, uint32_t k, uint32_t of_image, uint32_t code,
-                           uint32_t index, unsigned long long at) {
-        const uint32_t key = (of_image + rays.tile(reached, k)) << out.distance_bits | code;
-        out.entries[at + k] = uint64_t(key) << 32 | index;
+__device__ void write_entries(const RayRecord& record, const RayDirections& rays,
+                              const RayTiles& tiles, uint32_t num_tiles, uint32_t first_tile,
+                              float nearest, uint32_t index, unsigned long long first,
+                              uint32_t before, const RayLists& out) {
+    const auto write = [&](const RayTiles& reached, uint32_t k, uint32_t of_image, float distance,
+                           uint32_t of_record, unsigned long long at) {
+        const uint32_t code = code_of_distance(distance, nearest, out.distance_bits);
+        const uint32_t tile = of_image + rays.tile(reached, k);
+        out.entries[at + k] = entry_of(tile, code, out.distance_bits, of_record);
     };
     if (num_tiles <= kFewTiles)
-        for (uint32_t k = 0; k < num_tiles; ++k)
-            write(tiles, k, first_tile, distance, record, first + before);
+        for (uint32_t k = 0; k < num_tiles; ++k) {
+            const RayRange part = rays_in_tile(rays, record.range, tiles, k);
+            const float bound = nearest_in_tile(record.shape, rays, part);
+            write(tiles, k, first_tile, max_of(record.nearest, bound), index, first + before);
+        }
     for (unsigned large = __ballot_sync(kAllLanes, num_tiles > kFewTiles); large != 0;
          large &= large - 1) {
         const int owner = __ffs(static_cast<int>(large)) - 1;
@@ -168,11 +136,11 @@ __device__ void write_entries(const RayDirections& rays, const RayTiles& tiles, 
                                .num_rows = __shfl_sync(kAllLanes, tiles.num_rows, owner),
                                .num_columns = __shfl_sync(kAllLanes, tiles.num_columns, owner)};
         const uint32_t of_image = __shfl_sync(kAllLanes, first_tile, owner);
-        const uint32_t code = __shfl_sync(kAllLanes, distance, owner);
-        const uint32_t index = __shfl_sync(kAllLanes, record, owner);
+        const float distance = __shfl_sync(kAllLanes, record.nearest, owner);
+        const uint32_t of_record = __shfl_sync(kAllLanes, index, owner);
         const unsigned long long at = first + __shfl_sync(kAllLanes, before, owner);
         for (uint32_t k = threadIdx.x % 32; k < reached.count(); k += 32)
-            write(reached, k, of_image, code, index, at);
+            write(reached, k, of_image, distance, of_record, at);
     }
 }
 
@@ -245,10 +213,7 @@ __global__ void __launch_bounds__(kProjectThreads, kProjectBlocks)
             const unsigned long long at = counts.records() + __popc(kept & ((1u << lane) - 1));
             if (is_kept && at < out.record_capacity) store_record(record, out.records + at);
             if (counts.entries() + num_entries > out.entry_capacity) continue;
-            uint32_t distance = 0;
-            if (is_kept)
-                distance = code_of_distance(record.nearest, limits.nearest, out.distance_bits);
-            write_entries(rays, tiles, num_reached, image * num_tiles, distance,
+            write_entries(record, rays, tiles, num_reached, image * num_tiles, limits.nearest,
                           static_cast<uint32_t>(at), counts.entries(), before, out);
         }
     }
@@ -265,235 +230,45 @@ __global__ void first_kernel(const uint64_t* entries, uint32_t count, unsigned s
     for (uint32_t t = before; t <= tile; ++t) first[t] = i;
 }
 
-// Position of a hit in the blending order of a ray.
-struct HitKey {
-    float range;
-    uint32_t order;
+// Lists of similar lengths are in one class: the lengths up to 3, and four classes for
+// each power of two.
+constexpr unsigned kLengthClasses = 128;
+constexpr unsigned kOrderThreads = 1024;
 
-    __device__ bool operator<(const HitKey& other) const {
-        return range != other.range ? range < other.range : order < other.order;
-    }
-};
+// Returns the class of a list, 0 for the longest ones.
+__device__ unsigned class_of_length(uint32_t length) {
+    if (length < 4) return kLengthClasses - 1 - length;
+    const auto exponent = static_cast<unsigned>(31 - __clz(static_cast<int>(length)));
+    const unsigned mantissa = length >> (exponent - 2) & 3;
+    return kLengthClasses - 1 - (4 * (exponent - 1) + mantissa);
+}
 
-// The windows of a block's rays. Each window is a ring buffer with the nearest hits
-// that are not yet blended, in ascending order. Neighbouring threads use neighbouring
-// banks of shared memory.
-struct Windows {
-    float range[kWindow][kRayTileSize], alpha[kWindow][kRayTileSize];
-    uint32_t record[kWindow][kRayTileSize];
-};
-
-// The window of one ray.
-class RayWindow {
-  public:
-    __device__ RayWindow(Windows& memory, const RayRecord* records)
-        : memory_(memory), records_(records) {}
-
-    __device__ unsigned size() const { return size_; }
-    __device__ float nearest() const { return memory_.range[at(0)][threadIdx.x]; }
-    __device__ TileHit hit(unsigned k) const {
-        return {memory_.range[at(k)][threadIdx.x], memory_.alpha[at(k)][threadIdx.x],
-                memory_.record[at(k)][threadIdx.x]};
-    }
-    __device__ HitKey key(unsigned k) const {
-        return {memory_.range[at(k)][threadIdx.x],
-                __ldg(&records_[memory_.record[at(k)][threadIdx.x]].order)};
-    }
-    __device__ void drop_nearest() {
-        first_ = (first_ + 1) % kWindow;
-        --size_;
-    }
-    __device__ void drop_farthest() { --size_; }
-    // Inserts a hit. Precondition: the window is not full.
-    __device__ void insert(const TileHit& hit, uint32_t order) {
-        unsigned k = size_;
-        for (; k > 0; --k) {
-            const float before = memory_.range[at(k - 1)][threadIdx.x];
-            if (before < hit.range || (before == hit.range && key(k - 1).order < order)) break;
-            set(k, this->hit(k - 1));
-        }
-        set(k, hit);
-        ++size_;
-    }
-    __device__ void clear() { size_ = 0; }
-
-  private:
-    __device__ unsigned at(unsigned k) const { return (first_ + k) % kWindow; }
-    __device__ void set(unsigned k, const TileHit& hit) {
-        memory_.range[at(k)][threadIdx.x] = hit.range;
-        memory_.alpha[at(k)][threadIdx.x] = hit.alpha;
-        memory_.record[at(k)][threadIdx.x] = hit.record;
-    }
-
-    Windows& memory_;
-    const RayRecord* records_;
-    unsigned first_ = 0, size_ = 0;
-};
-
-// The result of a ray while it is blended: either colour and mean range, or returns.
-template <bool kReturns>
-class RayLight {
-  public:
-    __device__ RayLight(const ReturnRule& rule) {
-        if constexpr (kReturns) returns_.start(rule);
-    }
-    __device__ void add(const TileHit& hit, const float rgb[3], float transmittance) {
-        const float weight = hit.alpha * transmittance;
-        if constexpr (kReturns) {
-            returns_.add({hit.range, weight, luma_of(rgb)}, transmittance);
-        } else {
-            for (int c = 0; c < 3; ++c) color_[c] += weight * rgb[c];
-            weighted_range_ += weight * hit.range;
-        }
-    }
-    __device__ void write(float alpha, size_t out, const RayPlanes& planes) {
-        planes.alpha[out] = alpha;
-        if constexpr (kReturns) {
-            returns_.finish();
-            for (int k = 0; k < kMostReturns; ++k) {
-                planes.return_range[k][out] = returns_.found(k).range;
-                planes.return_intensity[k][out] = returns_.found(k).intensity;
-            }
-        } else {
-            for (int c = 0; c < 3; ++c) planes.color[3 * out + c] = color_[c];
-            planes.range[out] = alpha > 0 ? weighted_range_ / alpha : 0;
-        }
-    }
-
-  private:
-    struct Nothing {};
-    std::conditional_t<kReturns, ReturnFinder, Nothing> returns_;
-    float color_[3] = {0, 0, 0}, weighted_range_ = 0;
-};
-
-// Blends the rays of a tile. Launched with one block per tile and one thread per ray.
-template <bool kReturns>
-__global__ void __launch_bounds__(kRayTileSize)
-    cast_kernel(RayLists lists, const uint64_t* entries, const uint32_t* first, RayDirections rays,
-                RayLimits limits, RayPlanes planes) {
-    __shared__ Windows windows;
-    __shared__ float4 loaded[kLoaded][sizeof(RayRecord) / sizeof(float4)];
-    __shared__ uint64_t keys[kLoaded + 1];
-    const unsigned num_tiles = static_cast<unsigned>(rays.num_tiles());
-    const unsigned image = blockIdx.x / num_tiles, tile = blockIdx.x % num_tiles;
-    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    constexpr unsigned kWarpsAcross = kRayTileColumns / kWarpColumns;
-    const int warp_column = static_cast<int>(tile % rays.tile_columns() * kRayTileColumns +
-                                             warp % kWarpsAcross * kWarpColumns);
-    const int warp_row = static_cast<int>(tile / rays.tile_columns() * kRayTileRows +
-                                          warp / kWarpsAcross * kWarpRows);
-    const int column = warp_column + static_cast<int>(lane % kWarpColumns);
-    const int row = warp_row + static_cast<int>(lane / kWarpColumns);
-    const bool is_ray = column < rays.num_columns() && row < rays.num_rows();
-    const float x = rays.elevation_cosine[row] * rays.azimuth_cosine[column];
-    const float y = rays.elevation_cosine[row] * rays.azimuth_sine[column];
-    const float z = rays.elevation_sine[row];
-
-    const uint32_t begin = first[blockIdx.x], end = first[blockIdx.x + 1];
-    const uint32_t code_mask = (1u << lists.distance_bits) - 1;
-    const auto bound_of = [&](uint64_t key) {
-        return distance_of_code(static_cast<uint32_t>(key >> 32) & code_mask, limits.nearest,
-                                lists.distance_bits);
-    };
-    RayWindow window(windows, lists.records);
-    RayLight<kReturns> light(planes.rule);
-    float transmittance = 1;
-    bool is_over = !is_ray;
-    // Hits before `from` are already blended. Hits from `limit` on are left for the
-    // next pass.
-    HitKey from{-INFINITY, 0}, limit{INFINITY, ~0u};
-    bool is_limited = false;
-
-    const auto blend_before = [&](float range) {
-        while (window.size() > 0 && window.nearest() < range) {
-            const TileHit hit = window.hit(0);
-            window.drop_nearest();
-            light.add(hit, lists.records[hit.record].color, transmittance);
-            transmittance *= 1 - hit.alpha;
-            if (!(transmittance < limits.min_transmittance)) continue;
-            is_over = true;
-            window.clear();
-        }
-    };
-    const auto add_hit = [&](const TileHit& hit, uint32_t order, float bound) {
-        const HitKey key{hit.range, order};
-        if (key < from || !(key < limit)) {
-            is_limited = is_limited || !(key < from);
-            return;
-        }
-        if (window.size() == kWindow) blend_before(bound);
-        if (is_over) return;
-        if (window.size() == kWindow) {
-            is_limited = true;
-            const HitKey farthest = window.key(kWindow - 1);
-            if (!(key < farthest)) {
-                limit = key;
-                return;
-            }
-            limit = farthest;
-            window.drop_farthest();
-        }
-        window.insert(hit, order);
-    };
-
-    for (bool is_done = false; !is_done;) {
-        for (uint32_t base = begin; base < end; base += kLoaded) {
-            if (__syncthreads_and(is_over)) break;
-            const uint32_t count = min(kLoaded, end - base);
-            if (threadIdx.x <= kLoaded)
-                keys[threadIdx.x] =
-                    base + threadIdx.x < end ? entries[base + threadIdx.x] : ~uint64_t(0);
-            constexpr unsigned kVectors = sizeof(RayRecord) / sizeof(float4);
-            for (unsigned v = threadIdx.x; v < count * kVectors; v += kRayTileSize) {
-                const auto index = static_cast<uint32_t>(__ldg(entries + base + v / kVectors));
-                loaded[v / kVectors][v % kVectors] =
-                    reinterpret_cast<const float4*>(lists.records + index)[v % kVectors];
-            }
-            __syncthreads();
-            bool reaches = false;
-            if (lane < count) {
-                const RayRange& range = reinterpret_cast<const RayRecord*>(loaded[lane])->range;
-                const int last = warp_column + kWarpColumns - 1;
-                const bool is_in_rows = warp_row <= range.row1 && warp_row + kWarpRows > range.row0;
-                const bool is_in_columns =
-                    (warp_column <= range.column1 && last >= range.column0) ||
-                    warp_column + rays.num_columns() <= range.column1;
-                reaches = is_in_rows && is_in_columns;
-            }
-            unsigned left = __ballot_sync(kAllLanes, reaches);
-            if (__all_sync(kAllLanes, is_over)) left = 0;
-            for (; left != 0; left &= left - 1) {
-                const int e = __ffs(static_cast<int>(left)) - 1;
-                const RayRecord& record = *reinterpret_cast<const RayRecord*>(loaded[e]);
-                const RayHit<float> hit = hit_of(record.shape, x, y, z);
-                const float reach = record.shape.log2_opacity - float(kLog2MinAlpha);
-                const bool is_hit = !is_over && hit.falloff <= reach &&
-                                    hit.range >= limits.nearest && hit.range <= limits.farthest;
-                if (!is_hit) continue;
-                const float alpha = min_of(exp2_in_range(record.shape.log2_opacity - hit.falloff),
-                                           float(kMaxAlpha));
-                add_hit({hit.range, alpha, static_cast<uint32_t>(keys[e])}, record.order,
-                        bound_of(keys[e]));
-            }
-            if (!is_over) blend_before(base + kLoaded < end ? bound_of(keys[kLoaded]) : INFINITY);
-        }
-        if (!is_over) blend_before(INFINITY);
-        is_over = is_over || !is_limited;
-        from = limit;
-        limit = {INFINITY, ~0u};
-        is_limited = false;
-        is_done = __syncthreads_and(is_over);
-    }
-    if (!is_ray) return;
-    const size_t out = image * rays.num_rays() + rays.place(row, column);
-    light.write(1 - transmittance, out, planes);
+// Orders tiles by the classes of their lists, in one block. The blocks that blend start
+// in this order, so that no long list is left to the end. The order within a class
+// varies from run to run.
+__global__ void __launch_bounds__(kOrderThreads)
+    order_kernel(const uint32_t* first, uint32_t num_tiles, uint32_t* order) {
+    __shared__ uint32_t next[kLengthClasses];
+    if (threadIdx.x < kLengthClasses) next[threadIdx.x] = 0;
+    __syncthreads();
+    for (uint32_t tile = threadIdx.x; tile < num_tiles; tile += kOrderThreads)
+        atomicAdd(&next[class_of_length(first[tile + 1] - first[tile])], 1u);
+    __syncthreads();
+    uint32_t total;
+    const uint32_t before =
+        block_prefix(threadIdx.x < kLengthClasses ? next[threadIdx.x] : 0u, total);
+    if (threadIdx.x < kLengthClasses) next[threadIdx.x] = before;
+    __syncthreads();
+    for (uint32_t tile = threadIdx.x; tile < num_tiles; tile += kOrderThreads)
+        order[atomicAdd(&next[class_of_length(first[tile + 1] - first[tile])], 1u)] = tile;
 }
 
 }  // namespace
 
 unsigned distance_bits_of(size_t num_tiles) {
     const auto tile_bits = static_cast<unsigned>(std::bit_width(num_tiles));
-    return std::min(kKeyBits - std::min(tile_bits, kKeyBits - kLeastDistanceBits), kDistanceBits);
+    const unsigned left = kSortedBits - std::min(tile_bits, kSortedBits);
+    return std::clamp(left, kLeastDistanceBits, kDistanceBits);
 }
 
 void project_to_rays(const RayInput& in, const RayDirections& rays, const RayLimits& limits,
@@ -510,29 +285,23 @@ void project_to_rays(const RayInput& in, const RayDirections& rays, const RayLim
 void sort_entries(const RayLists& lists, size_t num_entries, size_t num_tiles,
                   RaySortBuffers& buffers, cudaStream_t stream) {
     uint64_t* sorted = buffers.sorted.reserve(lists.entry_capacity, stream);
-    const auto end_bit = static_cast<int>(32 + lists.distance_bits + std::bit_width(num_tiles - 1));
+    const auto end_bit =
+        static_cast<int>(kRecordBits + lists.distance_bits + std::bit_width(num_tiles - 1));
     const auto sort = [&](void* scratch, size_t& bytes) {
-        check(
-            cub::DeviceRadixSort::SortKeys(scratch, bytes, lists.entries, sorted,
-                                           static_cast<int64_t>(num_entries), 32, end_bit, stream),
-            "sort of rays");
+        check(cub::DeviceRadixSort::SortKeys(scratch, bytes, lists.entries, sorted,
+                                             static_cast<int64_t>(num_entries),
+                                             static_cast<int>(kRecordBits), end_bit, stream),
+              "sort of rays");
     };
     size_t bytes = 0;
     sort(nullptr, bytes);
     sort(buffers.scratch.reserve(bytes, stream), bytes);
     constexpr unsigned kThreads = 256;
     launch("first_kernel", first_kernel, blocks_for(num_entries + 1, kThreads), kThreads, 0, stream,
-           sorted, static_cast<uint32_t>(num_entries), 32 + lists.distance_bits,
+           sorted, static_cast<uint32_t>(num_entries), kRecordBits + lists.distance_bits,
            static_cast<uint32_t>(num_tiles), buffers.first.reserve(num_tiles + 1, stream));
-}
-
-void cast_rays(const RayLists& lists, const RaySortBuffers& sorted, size_t num_images,
-               const RayDirections& rays, const RayLimits& limits, const RayPlanes& planes,
-               cudaStream_t stream) {
-    const auto blocks = static_cast<unsigned>(num_images * rays.num_tiles());
-    launch("cast_kernel", planes.has_returns() ? cast_kernel<true> : cast_kernel<false>, blocks,
-           kRayTileSize, 0, stream, lists, sorted.sorted.data(), sorted.first.data(), rays, limits,
-           planes);
+    launch("order_kernel", order_kernel, 1, kOrderThreads, 0, stream, buffers.first.data(),
+           static_cast<uint32_t>(num_tiles), buffers.order.reserve(num_tiles, stream));
 }
 
 }  // namespace cuda

@@ -6,16 +6,20 @@
 #include "base/device.h"
 #include "frame/draw_list.h"
 #include "project/project_cuda.h"
+#include "rays/ray_entry.h"
 #include "rays/rays.h"
 
 namespace v3dg {
 namespace cuda {
 
-// A key has kKeyBits bits above the index of its record. Of these, at least
-// kLeastDistanceBits code the distance. This limits the number of tiles of all pictures
-// together to kMostRayTiles.
-constexpr unsigned kKeyBits = 32, kLeastDistanceBits = 8;
-constexpr size_t kMostRayTiles = (size_t(1) << (kKeyBits - kLeastDistanceBits)) - 1;
+// A tile is blended by one warp, with one lane per ray.
+constexpr int kRaysOfTile = 32;
+
+// Entries (ray_entry.h) code distances in at least kLeastDistanceBits, and in more as
+// long as no more than kSortedBits are sorted. This limits the number of tiles of all
+// pictures together to kMostRayTiles.
+constexpr unsigned kSortedBits = 32, kLeastDistanceBits = 8;
+constexpr size_t kMostRayTiles = (size_t(1) << (64 - kRecordBits - kLeastDistanceBits)) - 1;
 
 // The gaussians of a cast. A model is stored either in `rows` or in `coded`; its
 // element in the other list is empty. A list that no model uses is null.
@@ -38,8 +42,7 @@ struct RayInput {
 // updates both with one atomic operation. A cast has at most kMostRayGaussians
 // gaussians, so the records need no more than these bits. The other 36 bits count
 // entries.
-constexpr unsigned kRecordBits = 28;
-constexpr unsigned long long kMostRayGaussians = (1ull << kRecordBits) - 1;
+constexpr unsigned long long kMostRayGaussians = kMostRecords;
 struct RayListCounts {
     unsigned long long both;
 
@@ -47,10 +50,9 @@ struct RayListCounts {
     V3DG_HD unsigned long long entries() const { return both >> kRecordBits; }
 };
 
-// The records that may hit rays, and one key for each tile that a record reaches. From
-// the highest bit down, a key has the index of the tile (counted over all pictures),
-// the record's smallest distance, rounded down, and in the lowest 32 bits the index of
-// the record. The order of keys in memory varies from run to run.
+// The records that may hit rays, and one entry for each tile that a record reaches.
+// Tiles are counted over all pictures, and the distance of an entry is a lower bound on
+// the record's distances in the tile. The order in memory varies from run to run.
 struct RayLists {
     RayRecord* records;
     uint64_t* entries;
@@ -74,9 +76,10 @@ struct RaySortBuffers {
     DeviceBuffer<uint64_t> sorted;
     DeviceBuffer<unsigned char> scratch;
     DeviceBuffer<uint32_t> first;  // [tiles + 1] first entry of each tile
+    DeviceBuffer<uint32_t> order;  // [tiles] tiles, those with the longest lists first
 };
 
-// Sorts the entries, and finds the first entry of each tile.
+// Sorts the entries, finds the first entry of each tile, and orders the tiles.
 void sort_entries(const RayLists& lists, size_t num_entries, size_t num_tiles,
                   RaySortBuffers& buffers, cudaStream_t stream);
 

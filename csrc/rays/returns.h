@@ -89,23 +89,25 @@ class ReturnFinder {
     }
     V3DG_HD void store(const Median& median) {
         drop_up_to(0.5f * weight_);
-        if (size_ == kMostMedians)
-            return;  // cannot happen; keeps writes inside the
-                     // array
-        medians_[(first_ + size_) % kMostMedians] = median;
+        // This cannot happen, but it keeps writes inside the array.
+        if (size_ == kMostMedians) return;
+        if (size_ == 0) nearest_ = median;
+        const uint32_t place = first_ + size_;
+        medians_[place < kMostMedians ? place : place - kMostMedians] = median;
         ++size_;
     }
     // Drops the stored contributions up to which the layer's weight is less than
     // `half`.
     V3DG_HD void drop_up_to(float half) {
-        while (size_ > 0 && medians_[first_].passed < half) {
+        while (size_ > 0 && nearest_.passed < half) {
             first_ = first_ + 1 == kMostMedians ? 0 : first_ + 1;
             --size_;
+            if (size_ > 0) nearest_ = medians_[first_];
         }
     }
     V3DG_HD void end_layer() {
         drop_up_to(0.5f * weight_);
-        found_[num_found_] = {size_ > 0 ? medians_[first_].range : last_range_, intensity_};
+        found_[num_found_] = {size_ > 0 ? nearest_.range : last_range_, intensity_};
         ++num_found_;
         start_layer();
     }
@@ -116,6 +118,7 @@ class ReturnFinder {
     bool is_detected_;
     float weight_, intensity_, most_half_, last_range_, end_;
     uint32_t first_, size_;
+    Median nearest_;  // a copy of the first one, in registers
     Median medians_[kMostMedians];
 };
 

@@ -339,6 +339,44 @@ def test_several_poses_are_several_scans(device):
         batch[5]
 
 
+def part_of(scene, environment):
+    """Return the shared instances, then those of an environment."""
+    shared = np.flatnonzero(scene.environments == -1)
+    own = np.flatnonzero((scene.environments == environment) & (environment >= 0))
+    rows = np.concatenate([shared, own])
+    part = Scene()
+    part.add(
+        [scene.bundles[number] for number in scene.instance_bundle[rows]],
+        scene.positions[rows],
+        scene.quaternions[rows],
+        scene.scales[rows],
+    )
+    return part
+
+
+def test_a_sensor_sees_its_environment_and_what_is_shared(device):
+    rng = np.random.default_rng(20)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 24, spread=3)
+    scene.set_environment(rng.permutation(np.repeat([-1, 0, 1, 3], 6)))
+    poses = np.stack([pose_of(rng, rng.normal(size=3)) for _ in range(5)])
+    environment = [0, 3, -1, 2, 1]
+    batch = v3dg.scan(scene, LIDAR, poses, environment=environment, device=device)
+    alone = [
+        v3dg.scan(part_of(scene, number), LIDAR, pose, device=device)
+        for number, pose in zip(environment, poses, strict=True)
+    ]
+    one = v3dg.scan(scene, LIDAR, poses[1], environment=3, device=device)
+    same = v3dg.scan(scene, LIDAR, poses[:2], environment=3, device=device)
+    assert batch.gaussians == [scan.gaussians for scan in alone]
+    for name in PLANES:
+        expected = np.stack([host(getattr(scan, name)) for scan in alone])
+        np.testing.assert_array_equal(host(getattr(batch, name)), expected, err_msg=name)
+        np.testing.assert_array_equal(host(getattr(one, name)), expected[1], err_msg=name)
+        np.testing.assert_array_equal(host(getattr(same, name))[1], expected[1], err_msg=name)
+    everything = v3dg.scan(scene, LIDAR, poses[0], device=device)
+    assert everything.gaussians > alone[0].gaussians
+
+
 def test_many_hits_at_one_place_are_blended_in_order(device):
     """More gaussians than a window holds reach from the eye to beyond the wall, so that
     nothing is certain to be in front of anything."""
@@ -369,12 +407,52 @@ def test_many_hits_at_one_place_are_blended_in_order(device):
     assert np.isclose(light, layers[:, :, 2], atol=2e-3).mean() > 0.95
 
 
+@pytest.mark.parametrize("columns", [7, 400])
+def test_flat_gaussians_seen_from_the_side_are_blended_in_order(device, columns):
+    """Across a disc of a floor, the distances of the hits change by more than its
+    distance from the next disc."""
+    rng = np.random.default_rng(23)
+    count = 400
+    angles = rng.uniform(-math.pi, math.pi, count)
+    radii = rng.uniform(1, 6, count)
+    heights = np.full(count, -0.4) + rng.normal(0, 0.01, count)
+    means = np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)
+    quats = np.stack([np.ones(count), *rng.normal(0, 0.05, (3, count))], axis=1)
+    gaussians = Gaussians(
+        means=np.float32(means),
+        quats=np.float32(quats),
+        scales=np.tile(np.float32([0.5, 0.3, 0.004]), (count, 1)),
+        opacities=rng.uniform(0.05, 0.6, count).astype(np.float32),
+        sh=rng.uniform(-1, 1, (count, 1, 3)).astype(np.float32),
+    )
+    azimuth = np.linspace(-math.pi, math.pi, columns, endpoint=False)
+    lidar = Lidar(azimuth, np.linspace(-0.5, 0.1, 20), near=0.01)
+    scanned = scanned_on(device, gaussians, lidar, np.eye(4))
+    exact = reference_rays.cast(
+        gaussians, np.zeros(3), lidar.directions.reshape(-1, 3), near=lidar.near
+    )
+    assert_like(scanned.alpha, exact.alpha, exact.cutoff_distance, 1e-3)
+    layers = np.array(
+        [reference_rays.returns(ray, lidar.detection, lidar.gap) for ray in exact.contributions]
+    )
+    is_clear = exact.cutoff_distance > 1e-3
+    ranges = np.stack([scanned.range.ravel(), scanned.second_range.ravel()], axis=1)
+    assert np.isclose(ranges, layers[:, :, 0], rtol=1e-3)[is_clear].mean() > 0.97
+    light = np.stack([scanned.intensity.ravel(), scanned.second_intensity.ravel()], axis=1)
+    assert np.isclose(light, layers[:, :, 2], atol=2e-3)[is_clear].mean() > 0.97
+
+
 def test_opaque_rays_end_behind_a_small_share_of_the_light(device):
     wall = v3dg.join([dot((x, 0, 0), opacity=0.999, size=0.3) for x in (2.0, 3.0, 4.0)])
     scanned = scanned_on(device, wall, lidar_at([0.0]), np.eye(4))
     np.testing.assert_allclose(scanned.alpha, 1 - 1e-6, rtol=0, atol=1e-7)
     np.testing.assert_allclose(scanned.range, 2, rtol=1e-5)
     assert np.isinf(scanned.second_range).all()
+
+
+def some_bundle():
+    rng = np.random.default_rng(21)
+    return lod_bundle(rng, blob(rng, 40), 16)
 
 
 ERRORS = {
@@ -391,6 +469,15 @@ ERRORS = {
     "pose: expected a rotation": lambda: v3dg.scan(dot((1, 0, 0)), LIDAR, np.diag([1.0, 1, -1, 1])),
     "pose[1]: expected the last row": lambda: v3dg.scan(
         dot((1, 0, 0)), LIDAR, [np.eye(4), np.ones((4, 4))]
+    ),
+    "environment: expected None for an asset": lambda: v3dg.scan(
+        dot((1, 0, 0)), LIDAR, np.eye(4), environment=-1
+    ),
+    "environment: expected 1 whole numbers": lambda: v3dg.scan(
+        some_bundle(), LIDAR, np.eye(4), environment=[0, 0]
+    ),
+    "environment[0]: expected -1 to -1, as the scene has, got 0": lambda: v3dg.scan(
+        some_bundle(), LIDAR, np.eye(4), environment=0
     ),
     "pose[2]: expected finite numbers, got nan": lambda: v3dg.scan(
         dot((1, 0, 0)), LIDAR, [np.eye(4), np.eye(4), np.full((4, 4), math.nan)]
@@ -476,6 +563,28 @@ def test_poses_on_the_device_are_read_there():
     assert np.isclose(host(single.alpha), host(expected.alpha)[0], atol=1e-3).mean() > 0.99
     with pytest.raises(ValueError, match=r"^pose: expected a tensor on cpu"):
         v3dg.scan(scene, LIDAR, tensor, device="cpu")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dtype", ["int32", "int64"])
+def test_environments_on_the_device_are_read_there(dtype):
+    import torch
+
+    rng = np.random.default_rng(22)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 16), 12, spread=3)
+    scene.set_environment(np.arange(12) % 3)
+    poses = torch.tensor(np.stack([pose_of(rng, rng.normal(size=3)) for _ in range(3)])).cuda()
+    expected = v3dg.scan(scene, LIDAR, poses, environment=[2, 0, 1], device="cuda")
+    numbers = torch.tensor([2, 0, 1], dtype=getattr(torch, dtype), device="cuda")
+    made = v3dg.scan(scene, LIDAR, poses, environment=numbers, device="cuda")
+    np.testing.assert_array_equal(host(made.alpha), host(expected.alpha))
+    assert host(made.alpha).max() > 0.5
+    numbers[1] = 7
+    broken = v3dg.scan(scene, LIDAR, poses, environment=numbers, device="cuda")
+    assert host(broken.alpha)[1].max() == 0
+    np.testing.assert_array_equal(host(broken.alpha)[[0, 2]], host(expected.alpha)[[0, 2]])
+    with pytest.raises(ValueError, match=r"^environment: expected int32 or int64"):
+        v3dg.scan(scene, LIDAR, poses, environment=numbers.float(), device="cuda")
 
 
 @pytest.mark.gpu

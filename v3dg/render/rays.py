@@ -57,12 +57,15 @@ class RayFrame(ResidentFrame):
         sensor: _core.RaySensor,
         viewmats: Array,
         cut: CutRequest,
+        environments: Array | None,
         returns: tuple[float, float] | None,
     ) -> _core.Cast:
         """Cast the rays of a sensor at each of B poses; see `cast_rays`."""
         with residency.turn(self.device):
             resident = self._taken(subject)
-            return self._core.cast_scene(resident.core, sensor, viewmats, cut.rule, returns)
+            return self._core.cast_scene(
+                resident.core, sensor, viewmats, cut.rule, environments, returns
+            )
 
 
 def check_rays(
@@ -88,6 +91,8 @@ def cast_rays(
     viewmats: Array,
     cut: CutRequest,
     device: Device,
+    *,
+    environments: Array | None = None,
     returns: tuple[float, float] | None = None,
 ) -> _core.Cast:
     """Cast the rays of a sensor at each of B poses, through the cut of a scene or a
@@ -96,11 +101,14 @@ def cast_rays(
     Args:
         viewmats: (B, 4, 4) from world to sensor, as doubles in host memory, or as a
             float32 or float64 tensor on the device.
+        environments: (B,) int32 or, on a CUDA device, int64, where the poses are. None
+            for sensors that see all instances.
         returns: The minimum weight of a return, and the gap after it; None to compute
             colour and range instead.
 
     Raises:
-        ValueError: The cut has a budget, or an asset is drawn with a cut.
+        ValueError: The cut has a budget, an asset has a cut or environments, or an
+            environment on the host is none of the scene's.
     """
     check("budget", cut.budget is None, "none for rays, got one; leave it out")
     if device.is_cuda:
@@ -108,9 +116,11 @@ def cast_rays(
 
         viewmats = torch.as_tensor(viewmats, device=str(device)).contiguous()
     if isinstance(subject, Gaussians):
+        expected = "None for an asset, which has no instances, got numbers"
+        check("environment", environments is None, expected)
         return _cast_asset(subject, sensor, viewmats, cut, device, returns)
     frame = residency.once(subject, ("frame", "rays", device), lambda: RayFrame(device))
-    return frame.cast(subject, sensor, viewmats, cut, returns)
+    return frame.cast(subject, sensor, viewmats, cut, environments, returns)
 
 
 def _cast_asset(
