@@ -84,7 +84,11 @@ class Sensed:
     @property
     def clipped(self) -> Array:
         clipped = _requested("clipped", self._channels and self._channels.clipped)
-        return clipped.view(np.bool_)
+        if isinstance(clipped, np.ndarray):
+            return clipped.view(np.bool_)
+        import torch
+
+        return clipped.view(torch.bool)
 
 
 def _requested(name: str, plane: Array | None) -> Array:
