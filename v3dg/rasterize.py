@@ -308,8 +308,7 @@ def _planes(drawn: _core.Rasterized | _core.RasterizedViews) -> list[torch.Tenso
         if plane is None:
             planes.append(None)
         elif isinstance(drawn, _core.Rasterized):
-            # A view would forbid programs to change the picture in place.
-            planes.append(torch.as_tensor(plane).unsqueeze_(0))
+            planes.append(torch.as_tensor(plane).unsqueeze(0))
         else:
             planes.append(torch.as_tensor(plane))
     return planes

@@ -75,9 +75,7 @@ def published_levels(folder: Path) -> Iterator[tuple[int, v3dg.Gaussians]]:
 
 def everywhere(config: Config, level: v3dg.Gaussians) -> RenderedImage:
     """Draw the layout with these gaussians in every instance."""
-    bundle = v3dg.build_bundle(
-        level, config=BuildConfig.leaves_only(), quality="draft", progress=False
-    )
+    bundle = v3dg.build_bundle(level, config=BuildConfig.leaves_only(), progress=False)
     names = {config.asset.name: bundle}
     scene, cameras = v3dg.read_scene(config.layout, bundles=names)
     camera = list(cameras.values())[config.camera]
