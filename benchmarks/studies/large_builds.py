@@ -17,7 +17,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -34,6 +34,7 @@ class Config:
     """Numbers of gaussians of the builds, in millions."""
     memory: tuple[str, ...] = ("2GiB", "2GiB", "7GiB")
     """Limits of the host memory, one for each build."""
+    quality: Literal["draft", "standard", "best"] = "draft"
     device: str = "cuda"
     output: str | None = None
 
@@ -57,13 +58,15 @@ def main(config: Config) -> None:
                 str(bundle),
                 "--quiet",
             ]
-            command += ["--quality", "draft"]
+            command += ["--quality", config.quality]
             row |= watched([*command, "--memory", memory, "--device", config.device])
             row["bundle_bytes"] = bundle.stat().st_size
         row["us_a_gaussian"] = round(1e6 * row["seconds"] / count, 3)
         print(json.dumps(row), flush=True)
         rows.append(row)
-    record.write(config.output, {"device": config.device, "results": rows})
+    record.write(
+        config.output, {"device": config.device, "quality": config.quality, "results": rows}
+    )
 
 
 def write_copies(path: Path, base: v3dg.Gaussians, at_least: int) -> int:
