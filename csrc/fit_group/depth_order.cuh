@@ -43,12 +43,6 @@ __device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_
 
 template <class Fit>
 __device__ void rank_by_counting(const Fit& fit, int num_views) {
-    if (Fit::kSmall) {
-        for (uint32_t j = fit.first(); j < num_views * fit.n_padded; j += fit.stride())
-            rank_by_depth(fit, fit.keys() + j / fit.n_padded * fit.n_padded,
-                          j / fit.n_padded * fit.n_padded, j % fit.n_padded);
-        return;
-    }
     // All threads read all keys, so copy the keys to shared memory if there is room.
     // The same memory later holds the fragments.
     auto* copy = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
@@ -61,6 +55,58 @@ __device__ void rank_by_counting(const Fit& fit, int num_views) {
         __syncthreads();
         for (uint32_t i = fit.first(); i < fit.n_padded; i += fit.stride())
             rank_by_depth(fit, fits ? copy : fit.keys() + begin, begin, i);
+    }
+}
+
+// Returns the number of keys that are less than `bound`, in a sorted run of 32 keys.
+__device__ inline uint32_t num_below(const uint32_t* run, uint32_t bound) {
+    uint32_t num = 0;
+#pragma unroll
+    for (uint32_t step = 16; step > 0; step /= 2)
+        if (run[num + step - 1] < bound) num += step;
+    return num + (run[num] < bound ? 1 : 0);
+}
+
+// Sorts the gaussians of a small group. Each warp sorts runs of 32 keys. The rank of a
+// gaussian is then found by binary search in all runs of its view.
+template <class Fit>
+__device__ void rank_by_runs(const Fit& fit, int num_views) {
+    constexpr int kMost = kViewsAtOnce * kSmallCount / Fit::kThreads;
+    // The same memory later holds the fragments.
+    auto* sorted = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
+    static_assert(kViewsAtOnce * kSmallCount * sizeof(uint32_t) <=
+                      Fit::kWarps * fragments_bytes(Fit::kChunk),
+                  "the sorted runs fit into the memory of the fragments");
+    const uint32_t count = num_views * fit.n_padded, lane = threadIdx.x % 32;
+    uint32_t in_run[kMost];
+#pragma unroll
+    for (int m = 0; m < kMost; ++m) {
+        const uint32_t j = threadIdx.x + m * Fit::kThreads, run = j - lane;
+        if (j >= count) break;
+        const uint32_t key = fit.keys()[j];
+        const uint4* keys = reinterpret_cast<const uint4*>(fit.keys() + run);
+        uint32_t rank = 0;
+#pragma unroll
+        for (uint32_t q = 0; q < 8; ++q) {
+            const uint4 other = keys[q];
+            rank += (other.x < key + (4 * q < lane)) + (other.y < key + (4 * q + 1 < lane));
+            rank += (other.z < key + (4 * q + 2 < lane)) + (other.w < key + (4 * q + 3 < lane));
+        }
+        sorted[run + rank] = key;
+        in_run[m] = rank;
+    }
+    __syncthreads();
+#pragma unroll
+    for (int m = 0; m < kMost; ++m) {
+        const uint32_t j = threadIdx.x + m * Fit::kThreads, own = j - lane;
+        if (j >= count) break;
+        const uint32_t key = fit.keys()[j], begin = j / fit.n_padded * fit.n_padded;
+        uint32_t rank = in_run[m];
+        // Equal keys are ordered by index, so those in earlier runs count as smaller.
+#pragma unroll 4
+        for (uint32_t run = begin; run < begin + fit.n_padded; run += 32)
+            if (run != own) rank += num_below(sorted + run, key + (run < own ? 1 : 0));
+        fit.order()[begin + rank] = static_cast<typename Fit::Index>(j);
     }
 }
 
@@ -97,7 +143,9 @@ __device__ void sort_bitonic(const Fit& fit, int b) {
 // index.
 template <class Fit>
 __device__ void order_by_depth(const Fit& fit, int num_views) {
-    if (Fit::kSmall || fit.team_size > 1)
+    if constexpr (Fit::kSmall)
+        rank_by_runs(fit, num_views);
+    else if (fit.team_size > 1)
         rank_by_counting(fit, num_views);
     else
         for (int b = 0; b < num_views; ++b) sort_bitonic(fit, b);

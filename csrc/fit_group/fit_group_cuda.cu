@@ -24,9 +24,6 @@ namespace cuda {
 
 namespace {
 
-// Maximum number of gaussians in a small group. The picture of a small group is a
-// single region.
-constexpr uint32_t kSmallCount = 256;
 constexpr int kStepsPerPoll = 16;
 
 template <class Fit>

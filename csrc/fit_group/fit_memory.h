@@ -14,6 +14,9 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kViewsAtOnce = 2;
+// Maximum number of gaussians in a small group. The picture of a small group is a
+// single region.
+constexpr uint32_t kSmallCount = 256;
 // The size, px, of a cell and of a region. A half-warp blends a cell, and a CellMask
 // has one bit per cell of a region. Larger pictures have several regions.
 constexpr int kCell = 4, kCellPixels = kCell * kCell;

@@ -109,6 +109,13 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
         t = next;
         return;
     }
+    if (!(t > 0)) {
+        for (int i = 0; i < kCount; ++i) {
+            before[i] = t;
+            weight[i] = 0;
+        }
+        return;
+    }
     for (int i = 0; i < kCount; ++i) {
         before[i] = t;
         weight[i] = t > 0 ? blend_weight(alpha[i], t) : T(0);
