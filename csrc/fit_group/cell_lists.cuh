@@ -91,24 +91,34 @@ __device__ uint32_t assign_slots(const Fit& fit, int num_views) {
 template <class Fit>
 __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uint32_t slot_base,
                           int first_region, int last_region) {
-    constexpr int kLoads = 8;
+    // A thread adds up three values of a record, which are adjacent in each slot.
+    constexpr uint32_t kLoads = 4, kValues = 3, kParts = kSums / kValues;
+    static_assert(kParts * kValues == kSums);
     float* sums = fit.at(fit.layout.sums);
-    for (uint32_t q = fit.first(); q < num_views * fit.n_padded * kSums; q += fit.stride()) {
-        const uint32_t j = q / kSums, k = q - j * kSums;
-        float sum = first_region == 0 ? 0 : sums[kSumStride * j + k];
+    for (uint32_t q = fit.first(); q < num_views * fit.n_padded * kParts; q += fit.stride()) {
+        const uint32_t j = q / kParts, k = (q - j * kParts) * kValues;
+        float sum[kValues] = {0, 0, 0};
+        if (first_region > 0)
+            for (uint32_t v = 0; v < kValues; ++v) sum[v] = sums[kSumStride * j + k + v];
         for (int region = first_region; region < last_region; ++region) {
             const uint32_t count = __popcll(fit.mask(region)[j]);
             const float* slot =
                 slots + kSums * static_cast<size_t>(fit.slot_first(region)[j] - slot_base) + k;
-            for (uint32_t t = 0; t < count; t += kLoads) {
-                float x[kLoads];
+            for (uint32_t t = 0; t < count; t += kLoads, slot += kLoads * kSums) {
+                float x[kLoads][kValues];
 #pragma unroll
-                for (int l = 0; l < kLoads; ++l) x[l] = t + l < count ? slot[kSums * (t + l)] : 0;
+                for (uint32_t l = 0; l < kLoads; ++l)
 #pragma unroll
-                for (int l = 0; l < kLoads; ++l) sum += x[l];
+                    for (uint32_t v = 0; v < kValues; ++v)
+                        x[l][v] = t + l < count ? slot[kSums * l + v] : 0;
+#pragma unroll
+                for (uint32_t l = 0; l < kLoads; ++l)
+#pragma unroll
+                    for (uint32_t v = 0; v < kValues; ++v) sum[v] += x[l][v];
             }
         }
-        sums[kSumStride * j + k] = sum;
+#pragma unroll
+        for (uint32_t v = 0; v < kValues; ++v) sums[kSumStride * j + k + v] = sum[v];
     }
 }
 
