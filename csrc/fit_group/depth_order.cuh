@@ -74,9 +74,9 @@ __device__ void rank_by_runs(const Fit& fit, int num_views) {
     constexpr int kMost = kViewsAtOnce * kSmallCount / Fit::kThreads;
     // The same memory later holds the fragments.
     auto* sorted = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
-    static_assert(kViewsAtOnce * kSmallCount * sizeof(uint32_t) <=
-                      Fit::kWarps * fragments_bytes(Fit::kChunk),
-                  "the sorted runs fit into the memory of the fragments");
+    static_assert(
+        kViewsAtOnce * kSmallCount * sizeof(uint32_t) <= Fit::kWarps * fragments_bytes(Fit::kChunk),
+        "the sorted runs fit into the memory of the fragments");
     const uint32_t count = num_views * fit.n_padded, lane = threadIdx.x % 32;
     uint32_t in_run[kMost];
 #pragma unroll
