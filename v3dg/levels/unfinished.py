@@ -269,6 +269,7 @@ class Unfinished:
                 discard_units(self._path)
             self._path.unlink()
         elif self._bundle_path is not None:
+            discard_units(self._path)  # of a refinement that was killed earlier
             _files.put_in_place(self._path, self._bundle_path)
         return Bundle.open(self._bundle_path or self._path)
 
