@@ -38,9 +38,15 @@ def free_memory(num_bytes):
     """Leave at most this much memory of the GPU free."""
     import torch
 
+    torch.cuda.synchronize()
     torch.cuda.empty_cache()
-    free = torch.cuda.mem_get_info()[0]
-    rest = torch.empty(max(0, free - num_bytes), dtype=torch.uint8, device="cuda")
+    # The first allocation can fail, because the driver takes memory of its own for it.
+    for attempt in range(3):
+        free = torch.cuda.mem_get_info()[0]
+        with contextlib.suppress(torch.OutOfMemoryError):
+            rest = torch.empty(max(0, free - num_bytes), dtype=torch.uint8, device="cuda")
+            break
+        assert attempt < 2, "could not take the memory of the GPU"
     try:
         yield
     finally:
