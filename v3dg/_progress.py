@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Progress: TypeAlias = bool | Callable[[int, int, str], object]
 """Whether to show progress, or a function that is called with the amount of finished
-work, the total, and a text."""
+work, the total, and a text about the current work."""
 
 _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())

@@ -320,7 +320,7 @@ class StereoCamera:
 def check_camera(camera: object) -> None:
     """Raise TypeError unless a value is a camera or a stereo camera."""
     if not isinstance(camera, StereoCamera):
-        check_type("camera", camera, Camera, "a Camera")
+        check_type("camera", camera, Camera, "a Camera or a StereoCamera")
 
 
 def for_each(

@@ -181,8 +181,9 @@ class HeaderReader {
         check_entry(root, table.name, table.dtype, table.value_bytes, shape);
     }
 
-    // Compares the entry of a tensor in the header with the expected one, which follows
-    // from its shape and from the tensors before it.
+    // Fails unless the header's entry of a tensor is the expected one, which follows from
+    // its type and shape and from the tensors before it. Records where the tensor is, so
+    // tensors must be checked in the order of the file.
     void check_entry(const Json& root, const std::string& name, const std::string& dtype,
                      uint64_t value_bytes, const std::vector<uint64_t>& shape) {
         uint64_t size = value_bytes;

@@ -65,8 +65,9 @@ class DeviceWindows {
     // [count] number of items of each window
     const uint32_t* num_items() const { return num_items_.data(); }
 
-    // Enqueues the writing of the items of all windows, one window after another. The
-    // records of item i begin at kItemSize * i.
+    // Enqueues a kernel that writes the items of all windows to `items`: those of the
+    // first window, then those of the second, and so on. The records of item i of the
+    // whole list begin at kItemSize * i.
     void write_items(const DeviceTable& table, const Appearance<float>& appearance,
                      const ItemList& items, cudaStream_t stream) const;
 

@@ -43,7 +43,8 @@ V3DG_HD inline int floor_to_int(float x) {
 // positive. Denormal numbers are treated as the smallest normal number.
 V3DG_HD inline float rough_reciprocal(float x) {
 #ifdef __CUDA_ARCH__
-    float inverse;  // this instruction does not handle numbers out of range
+    float inverse;
+    // The instruction flushes denormal numbers to zero, and would return infinity.
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(fmaxf(x, 1.17549435e-38f)));
     return inverse;
 #else

@@ -231,9 +231,10 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
     SpreadShared<kLog2Spread>& s = space.even;
     uint32_t (&of_chunk)[1 << kLog2Spread] = space.finer;
     TileEntry* chunk = space.chunk;
-    const uint32_t num_buckets = buckets.last + 1,
-                   // Size of the counts of one chunk, in entries.
-        counts_room = num_buckets / 4;
+    const uint32_t num_buckets = buckets.last + 1;
+    // Shared memory for the counts of one chunk, in entries: an entry has room for four
+    // counts of 16 bits.
+    const uint32_t counts_room = num_buckets / 4;
     uint32_t num_chunks = 1;
     const auto size_of_chunk = [&] { return (count + num_chunks - 1) / num_chunks; };
     const auto has_room = [&] { return size_of_chunk() + num_chunks * counts_room <= most; };

@@ -211,7 +211,7 @@ def test_a_build_that_is_killed_leaves_its_levels(file, device, tmp_path):
     finally:
         process.kill()
         process.wait()
-    # A process that is killed while it refines cannot remove the locked folder of units.
+    # A process that is killed while it refines cannot remove the folder of units.
     assert set(names_in(tmp_path)) - {"out.v3dg.units"} == {"asset.ply", "out.v3dg.partial"}
     units = tmp_path / "out.v3dg.units"
     units.mkdir(exist_ok=True)

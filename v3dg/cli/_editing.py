@@ -49,7 +49,7 @@ class EditOptions:
     ones are zero, for programs that only read files of degree 3."""
 
     def option_names(self) -> list[str]:
-        """Return the names of the options on the command line."""
+        """Return the names of those of these options that were given."""
         options = {
             "--add": self.add,
             "--drop-outliers": self.drop_outliers,

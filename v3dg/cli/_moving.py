@@ -28,7 +28,7 @@ class MoveOptions:
     """Translate by this vector, after --scale and --rotate."""
 
     def option_names(self) -> list[str]:
-        """Return the names of the options on the command line."""
+        """Return the names of those of these options that were given."""
         values = {
             "--scale": self.scale,
             "--rotate": self.rotate,

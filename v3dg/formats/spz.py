@@ -47,7 +47,8 @@ _STREAM_SIZES = struct.Struct("<QQ")
 MAX_START = 1 << 16
 """The header is always within this number of bytes from the start of the file, even
 after the optional fields of a gzip header."""
-# maximum size of the extensions of vendors, which follow the attributes
+# Maximum number of bytes that are read of the extensions of vendors, which follow the
+# attributes. A small compressed stream could otherwise expand to any size.
 _MAX_TRAILER = 1 << 20
 _COLOR_SCALE = 0.15
 _MAX_DEGREE = 3  # coefficients of degree 4 are dropped

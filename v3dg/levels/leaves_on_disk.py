@@ -385,8 +385,12 @@ def _ends_in_buckets(
     block: int,
     asset_gaussians: int,
 ) -> npt.NDArray[np.int64]:
-    """Return (B, blocks + 1) positions in `order` for B buckets: the start of the
-    bucket, then the end of its gaussians from each block."""
+    """Return positions in `order`, (B, blocks + 1) for B buckets.
+
+    A row has the start of its bucket and then, for each block of `block` gaussians of
+    the asset, the end of those that come from this block. Within a bucket, `order` must
+    be ascending, so that the gaussians of a block are contiguous.
+    """
     counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
     for bucket, (begin, end) in enumerate(
         zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)

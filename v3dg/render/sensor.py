@@ -249,7 +249,7 @@ def _tensor(
     return tensor.detach().to(getattr(torch, dtype)).contiguous()
 
 
-_KINDS_OF_COLOR = "floats, 1 for white, or uint8, 255 for white"
+_KINDS_OF_COLOR = "floats (white is 1) or uint8 (white is 255)"
 
 
 def _color_tensor(plane: Array, shape: tuple[int, ...], device: Device) -> torch.Tensor | None:

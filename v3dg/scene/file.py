@@ -325,8 +325,8 @@ def _named(node: Node, subjects: Mapping[str, _Subject], kind: str) -> _Subject:
 
 
 def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
-    """Add instances to a scene, in the order of the file. Neighbouring instances of
-    bundles are added together."""
+    """Add instances to a scene, in the order of the file. Instances of bundles that
+    follow each other in the file are added with one call."""
     for is_nested, run in itertools.groupby(instances, lambda i: isinstance(i.subject, Scene)):
         if not is_nested:
             _add_bundles(scene, list(run))

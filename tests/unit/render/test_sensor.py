@@ -242,7 +242,7 @@ def test_colours_of_8_bits_are_those_of_images(scene):
     floats = MeshLayer(bytes_of_mesh / np.float32(255), depth)
     assert_same(picture, v3dg.render(scene, camera_at(), mesh=floats, **options), ("color",))
     for wrong in (bytes_of_mesh.astype(np.int64), bytes_of_mesh > 3):
-        with pytest.raises(ValueError, match=r"mesh.color: expected floats, 1 for white, or uint8"):
+        with pytest.raises(ValueError, match=r"mesh.color: expected floats .white is 1. or uint8"):
             v3dg.render(scene, camera_at(), mesh=MeshLayer(wrong, depth), **options)
 
 

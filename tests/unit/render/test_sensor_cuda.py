@@ -432,7 +432,7 @@ def test_tensors_of_8_bits_are_colours_of_images(scene):
     ]
     assert torch.equal(pictures[0].color, pictures[1].color)
     wrong = dataclasses.replace(mesh, color=colors.int())
-    with pytest.raises(ValueError, match=r"mesh.color: expected floats, 1 for white, or uint8"):
+    with pytest.raises(ValueError, match=r"mesh.color: expected floats .white is 1. or uint8"):
         v3dg.render(scene, camera_at(), mesh=wrong, device="cuda")
 
 

@@ -148,7 +148,8 @@ export class Camera {
   }
 
   /**
-   * Sets the rotation of the camera. In orbit mode, the camera moves around the focus.
+   * Turns the camera by a rotation in world space: around the focus in orbit mode, and
+   * around its own position otherwise.
    * @param {Quaternion} rotation
    */
   rotate(rotation) {
