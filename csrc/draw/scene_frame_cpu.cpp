@@ -253,7 +253,8 @@ SceneFrameCounts draw_picture(const HostScene& scene, const BatchRequest& reques
         return draw_selected(scene, one, request.rule, {&picture, 1}, {&sensor, 1}, workspace,
                              nullptr);
     const SeenInstances seen(scene.instances, cameras.environments, environment);
-    return draw_selected(seen.part_of(scene), one, request.rule, {&picture, 1}, {&sensor, 1}, workspace, nullptr);
+    return draw_selected(seen.part_of(scene), one, request.rule, {&picture, 1}, {&sensor, 1},
+                         workspace, nullptr);
 }
 
 }  // namespace

@@ -80,8 +80,8 @@ void make_hashes_fit(std::string& data) {
         first = end;
     }
     const v3dg::FilePart hash = header.parts.at("hash");
-    const std::string covered = data.substr(0, start) +
-                                data.substr(start + pages_bytes, hash.first - pages_bytes);
+    const std::string covered =
+        data.substr(0, start) + data.substr(start + pages_bytes, hash.first - pages_bytes);
     if (header.version > 2)
         put_hash_of_pieces(covered, data, start + hash.first);
     else
@@ -105,8 +105,13 @@ struct Rows {
           scales(3 * count + 1),
           opacities(count + 1),
           sh(48 * count + 1),
-          memory{means.data(), quaternions.data(), scales.data(), opacities.data(), sh.data(),
-                 count, 3} {}
+          memory{means.data(),
+                 quaternions.data(),
+                 scales.data(),
+                 opacities.data(),
+                 sh.data(),
+                 count,
+                 3} {}
 };
 
 void read_pages(const v3dg_scene* scene, uint32_t bundle) {

@@ -28,7 +28,8 @@ using namespace v3dg;
 constexpr int32_t kBundles = 169, kPages = 4096;  // pages of the finest level of a bundle
 constexpr int64_t kRows = 200;                    // gaussians of a cluster
 constexpr size_t kSlots = 120000;
-constexpr size_t kNeeds = 40000, kNearly = 10000;  // pages of the window, and of the margin at each end
+constexpr size_t kNeeds = 40000,
+                 kNearly = 10000;  // pages of the window, and of the margin at each end
 
 // A page has two clusters. Each level has half as many pages as the next finer one; the coarsest
 // level has one.
