@@ -404,7 +404,9 @@ def _picture(
     import torch
 
     if depth is None:
-        return color
+        # On a GPU, the backward pass reads the picture again, and programs may change
+        # the pictures of gsplat in place.
+        return color.clone() if color.is_cuda and color.requires_grad else color
     if look.depth == "D":
         depth = depth * alpha
     if not look.has_color:
