@@ -71,7 +71,8 @@ def refine_bundle(
             of them for each optimisation step, so the number is rounded up.
         drop: Fraction of a level's visibility, 0 to 0.5, that may be lost by dropping
             its least visible gaussians. 0 keeps all gaussians. Each further refinement
-            of a bundle drops gaussians again.
+            of a bundle drops gaussians again. An asset that is mostly of opacities
+            below 0.1, such as smoke, keeps all gaussians, because it hides none.
         seed: Seed of the pictures.
         device: The device that computes.
         progress: See `build_bundle`.

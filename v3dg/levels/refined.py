@@ -21,6 +21,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.rows import in_runs
+from v3dg.levels.smooth import is_faint
 from v3dg.levels.viewpoints import SeenFrom
 from v3dg.residency import residency
 
@@ -129,11 +130,13 @@ def without_unseen(
     first_level: int = 1,
 ) -> Bundle:
     """Return the bundle without the least visible gaussians of each level, beginning
-    with level `first_level`.
+    with level `first_level`. A faint asset keeps all: none of its gaussians is hidden.
 
     `drop` is the fraction of a level's visibility that may be lost. Visibility is
     measured in pictures of cuts.
     """
+    if is_faint(bundle.level_gaussians(0)):
+        return bundle
     cuts = Cuts(bundle, cameras, seed, device, progress)
     weights, looks = cuts.weights(_NUM_WEIGHING_PICTURES)
     known_weights = np.where(looks < _LEAST_LOOKS, np.nan, weights)

@@ -120,6 +120,12 @@ def test_refined_cuts_keep_alpha_and_colour(drafts, device):
         np.testing.assert_allclose(ratios(asset, moved, 14, device), 1, atol=0.025)
 
 
+def test_a_faint_asset_loses_no_gaussians(drafts):
+    for (_, bundle), is_faint in zip(drafts, (True, False), strict=True):
+        moved = v3dg.refine_bundle(bundle, steps=1, drop=0.1, device="cpu", progress=False)
+        assert (moved.num_gaussians == bundle.num_gaussians) == is_faint
+
+
 @pytest.mark.slow
 def test_a_refinement_by_pixels_and_cells_alone_darkens(drafts, monkeypatch):
     """The medians of small cells are below their means, too."""
