@@ -406,7 +406,9 @@ def _picture(
     if depth is None:
         # On a GPU, the backward pass reads the picture again, and programs may change
         # the pictures of gsplat in place.
-        return color.clone() if color.is_cuda and color.requires_grad else color
+        if color.is_cuda and color.requires_grad:
+            return color.clone()
+        return color
     if look.depth == "D":
         depth = depth * alpha
     if not look.has_color:
