@@ -44,9 +44,7 @@ def refine_bundle(
     drops the least visible gaussians of each level above level 0, and optimises the
     others until the pictures match. The number of gaussians in a cut ranges from that
     of the last level to 0.7 times that of the asset. The size of a picture ranges from
-    0.18 to 9.7 times the native size of its cut, which is 2 px² per gaussian. The last
-    30 % of the pictures show only coarse cuts: at most 0.08 times the gaussians of the
-    asset, and sizes of up to 16.
+    0.18 to 9.7 times the native size of its cut, which is 2 px² per gaussian.
     docs/levels.md describes the gain.
 
     The same bundle, cameras, steps, share and seed give the same bits on the same kind

@@ -114,7 +114,7 @@ def drafts(faint_cloud, dark_ball):
 
 
 def test_refined_cuts_keep_alpha_and_colour(drafts, device):
-    pictures = max(4_000, 1_000 * refined.default_steps(_device.resolve(device)).windows)
+    pictures = 1_000 * refined.default_steps(_device.resolve(device)).windows
     for asset, bundle in drafts:
         moved = v3dg.refine_bundle(bundle, steps=pictures, device=device, progress=False)
         np.testing.assert_allclose(ratios(asset, moved, 14, device), 1, atol=0.025)
