@@ -1028,8 +1028,6 @@ class CutPictures:
         asset: Rows,
         cameras: Sequence[Camera],
         seed: int,
-        most_of_asset: float,
-        octaves: float,
     ) -> None: ...
     def view(self, number: int, cut: int = 0) -> tuple[Camera, Int32, int]: ...
 

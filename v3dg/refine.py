@@ -44,9 +44,7 @@ def refine_bundle(
     drops the least visible gaussians of each level above level 0, and optimises the
     others until the pictures match. The number of gaussians in a cut ranges from that
     of the last level to 0.7 times that of the asset. The size of a picture ranges from
-    0.18 to 9.7 times the native size of its cut, which is 2 px² per gaussian. The last
-    30 % of the pictures show only coarse cuts: at most 0.08 times the gaussians of the
-    asset, and sizes of up to 16.
+    0.18 to 9.7 times the native size of its cut, which is 2 px² per gaussian.
     docs/levels.md describes the gain.
 
     The same bundle, cameras, steps, share and seed give the same bits on the same kind
@@ -71,7 +69,8 @@ def refine_bundle(
             of them for each optimisation step, so the number is rounded up.
         drop: Fraction of a level's visibility, 0 to 0.5, that may be lost by dropping
             its least visible gaussians. 0 keeps all gaussians. Each further refinement
-            of a bundle drops gaussians again.
+            of a bundle drops gaussians again. An asset that is mostly of opacities
+            below 0.1, such as smoke, keeps all gaussians, because it hides none.
         seed: Seed of the pictures.
         device: The device that computes.
         progress: See `build_bundle`.

@@ -102,13 +102,11 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target,
 class BoundPictures {
   public:
     BoundPictures(const BoundTable& table, const Rows& asset,
-                  const std::vector<BoundCamera>& cameras, uint64_t seed, double most_of_asset,
-                  double octaves)
+                  const std::vector<BoundCamera>& cameras, uint64_t seed)
         : asset_(asset),
           cameras_(cameras_of(cameras)),
           pictures_(pictures_of_cuts(table.table(), on_host(asset),
-                                     {cameras_.data(), cameras_.size()}, seed,
-                                     checked_ranges(most_of_asset, octaves))) {}
+                                     {cameras_.data(), cameras_.size()}, seed)) {}
 
     const CutPictures& pictures() const { return pictures_; }
     py::tuple view(uint64_t number, size_t cut) const {
@@ -136,15 +134,6 @@ class BoundPictures {
     }
 
   private:
-    static CutRanges checked_ranges(double most_of_asset, double octaves) {
-        if (!(most_of_asset > 0 && most_of_asset <= 1))
-            refuse_value("most_of_asset", "expected a share above 0 and up to 1, got " +
-                                              std::to_string(most_of_asset));
-        if (!(octaves > 0 && octaves <= 16))
-            refuse_value("octaves",
-                         "expected a number above 0 and up to 16, got " + std::to_string(octaves));
-        return {.most_of_asset = most_of_asset, .octaves = octaves};
-    }
     static std::vector<Camera> cameras_of(const std::vector<BoundCamera>& bound) {
         std::vector<Camera> cameras;
         for (const BoundCamera& camera : bound) cameras.push_back(camera.camera);
@@ -296,12 +285,9 @@ void bind_fit_level(py::module_& m) {
     py::class_<BoundPictures>(
         m, "CutPictures",
         "Pictures of cuts of a bundle, from random directions or from given cameras. The asset "
-        "is level 0. A cut has at most a share of the asset's gaussians. Sizes are up to "
-        "2^octaves times 0.18 times the native size of the cut.")
-        .def(py::init<const BoundTable&, const Rows&, const std::vector<BoundCamera>&, uint64_t,
-                      double, double>(),
-             py::kw_only(), "table"_a, "asset"_a, "cameras"_a, "seed"_a, "most_of_asset"_a,
-             "octaves"_a, py::keep_alive<1, 2>())
+        "is level 0.")
+        .def(py::init<const BoundTable&, const Rows&, const std::vector<BoundCamera>&, uint64_t>(),
+             py::kw_only(), "table"_a, "asset"_a, "cameras"_a, "seed"_a, py::keep_alive<1, 2>())
         .def("view", &BoundPictures::view, "number"_a, "cut"_a = 0,
              "Returns the camera of a view's window, the clusters of one cut in this window, and"
              " the samples per pixel side of the asset's picture.");

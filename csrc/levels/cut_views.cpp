@@ -22,8 +22,9 @@ constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of the width an
 // The px² per gaussian at the native size of a cut. At this size, the default tolerance
 // selects the cut.
 constexpr double kNativePx2 = 2;
-// The smallest size of a picture, relative to the native size of its cut.
-constexpr double kLeastSize = 0.18;
+// The range of a picture's size, relative to the native size of its cut: the smallest
+// value, and the number of octaves.
+constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
 constexpr double kDistance = 2.5;  // distance of the camera from the centre, in radii
 constexpr double kNear = 0.01;     // near depth, in radii
 constexpr int kMostTries = 16;     // number of attempts to find a gaussian inside the
@@ -31,6 +32,7 @@ constexpr int kMostTries = 16;     // number of attempts to find a gaussian insi
 constexpr int kMostTriesOfShare = 64;
 // An upper bound on how many random numbers one view, or one of its shares, needs.
 constexpr uint64_t kRandomNumbersOfView = 1024;
+constexpr double kMostOfAsset = 0.7;  // largest share of the asset's gaussians in a cut
 // Fraction of the gaussians that CutPictures::ball contains. The ball ignores outliers.
 constexpr double kShare = 0.99;
 
@@ -178,7 +180,7 @@ double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t
     for (int tries = 0; tries < kMostTriesOfShare; ++tries) {
         const double share = share_of_part(pictures, random.uniform());
         const double octaves = std::log2(view.size / std::sqrt(share) / kLeastSize);
-        if (octaves >= 0 && octaves < pictures.ranges.octaves) return share;
+        if (octaves >= 0 && octaves < kOctavesOfSize) return share;
     }
     return view.share;
 }
@@ -244,13 +246,12 @@ Surroundings surroundings_of(Span<const float> means, double share) {
 }
 
 CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
-                             Span<const Camera> cameras, uint64_t seed, const CutRanges& ranges) {
+                             Span<const Camera> cameras, uint64_t seed) {
     const Span<const float> means{asset.means, 3 * asset.size};
     CutPictures pictures{.table = table,
                          .means = means,
                          .cameras = cameras,
                          .seed = seed,
-                         .ranges = ranges,
                          .most = 0,
                          .least = 0,
                          .weight = {},
@@ -258,8 +259,7 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
     for (const int32_t c : table.top_cluster)
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
-    pictures.most =
-        std::max(ranges.most_of_asset * static_cast<double>(asset.size), pictures.least);
+    pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
     // Weight gaussians by their approximate size on screen: the mean of the two larger
     // scales, times the opacity.
     double sum = 0;
@@ -277,8 +277,7 @@ AssetView asset_view(const CutPictures& pictures, uint64_t number) {
     Random random(pictures.seed, number, 0);
     AssetView view{};
     view.share = share_of_part(pictures, random.uniform());
-    view.size =
-        kLeastSize * std::exp2(pictures.ranges.octaves * random.uniform()) * std::sqrt(view.share);
+    view.size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform()) * std::sqrt(view.share);
     view.num_gaussians = static_cast<double>(pictures.weight.size());
     const bool has_cameras = pictures.cameras.size > 0;
     Camera camera;

@@ -39,13 +39,6 @@ struct AssetView {
     double num_gaussians;  // number of gaussians in the picture, all of them of level 0
 };
 
-// The ranges of random pictures: the largest share of the asset's gaussians in a cut, and
-// the octaves from the smallest size of a picture, 0.18 times the native size of its
-// cut, to the largest.
-struct CutRanges {
-    double most_of_asset, octaves;
-};
-
 // Describes pictures of cuts of one bundle. Budgets and sizes are random. Cameras are
 // given, or look at a centre from random directions.
 struct CutPictures {
@@ -53,7 +46,6 @@ struct CutPictures {
     Span<const float> means;  // [N * 3] means of the asset's gaussians
     Span<const Camera> cameras;
     uint64_t seed;
-    CutRanges ranges;
     double most, least;  // bounds on the number of gaussians in a cut
     std::vector<double>
         // [N] prefix sums of the probabilities of a window around each gaussian
@@ -62,10 +54,10 @@ struct CutPictures {
 };
 
 // Returns the description of the pictures of a bundle and its asset, which must not be
-// empty. The smallest cuts are the coarsest cut. The result points to the arguments,
-// except for the seed and the ranges.
+// empty. The largest cuts have 0.7 times the asset's gaussians, and the smallest are
+// the coarsest cut. The result points to the arguments, except for the seed.
 CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
-                             Span<const Camera> cameras, uint64_t seed, const CutRanges& ranges);
+                             Span<const Camera> cameras, uint64_t seed);
 
 // Returns view `number`, which depends only on the arguments. With given cameras, the
 // share and the size refer to the gaussians in the camera's frustum. Without them, they

@@ -82,15 +82,15 @@ def names_in(folder):
 @pytest.mark.parametrize(
     ("quality", "num_gaussians", "sh_degree", "steps"),
     [
-        ("standard", 1000, 0, 26_010),
-        ("standard", 500_000, 3, 31_000),
-        ("standard", 4_000_000, 0, 66_000),
-        ("best", 500_000, 0, 155_000),
+        ("standard", 1000, 0, 18_010),
+        ("standard", 500_000, 3, 23_000),
+        ("standard", 4_000_000, 0, 58_000),
+        ("best", 500_000, 0, 115_000),
         # An asset of 10 million gaussians has four units of 2.5 million, or eight of
         # 1.25 million.
-        ("standard", 10_000_000, 0, 51_000),
-        ("standard", 10_000_000, 3, 38_500),
-        ("best", 10_000_000, 0, 255_000),
+        ("standard", 10_000_000, 0, 43_000),
+        ("standard", 10_000_000, 3, 30_500),
+        ("best", 10_000_000, 0, 215_000),
     ],
 )
 def test_large_assets_are_refined_by_more_pictures(quality, num_gaussians, sh_degree, steps):
@@ -193,7 +193,7 @@ def test_a_refinement_that_is_interrupted_begins_again(
 
 
 def test_a_build_that_is_killed_leaves_its_levels(file, device, tmp_path):
-    """A refinement with 26,010 pictures is far from its end when it is killed."""
+    """A refinement with 18,010 pictures is far from its end when it is killed."""
     output = tmp_path / "out.v3dg"
     roots = [str(Path(path).parents[1]) for path in (v3dg.__file__, Path(__file__).parent)]
     roots.append(os.environ.get("PYTHONPATH", ""))

@@ -163,16 +163,12 @@ def test_what_a_progress_function_raises_ends_it(bundle, drop):
         refine_bundle(bundle, steps=300, drop=drop, device="cpu", progress=stop)
 
 
-RANGES = {"most_of_asset": 0.7, "octaves": 5.75}
-
-
-def pictures_of(bundle, cameras=(), ranges=RANGES):
+def pictures_of(bundle, cameras=()):
     return _core.CutPictures(
         table=residency.table(bundle),
         asset=bundle.level_gaussians(0).rows,
         cameras=[camera.core for camera in cameras],
         seed=0,
-        **ranges,
     )
 
 
@@ -199,27 +195,6 @@ def test_pictures_are_of_all_sizes_from_all_around(bundle):
     counts = [len(clusters) for _, clusters, _ in views]
     assert min(counts) < 3
     assert max(counts) > 10
-
-
-def test_coarse_pictures_are_of_few_gaussians(bundle):
-    coarse = {"most_of_asset": 0.02, "octaves": 6.5}
-    sizes = np.diff(bundle.clusters.offset)
-    most = 0.02 * bundle.num_leaves
-    pictures = pictures_of(bundle, ranges=coarse)
-    counts = [sizes[pictures.view(number)[1]].sum() for number in range(100)]
-    assert 0.25 * most < max(counts) <= most
-    widest = [
-        max(pictures_of(bundle, ranges=ranges).view(number)[0].width for number in range(100))
-        for ranges in (coarse | {"octaves": 3.0}, coarse)
-    ]
-    assert widest[0] < 0.3 * widest[1]
-
-
-@pytest.mark.parametrize("name", ["most_of_asset", "octaves"])
-@pytest.mark.parametrize("value", [0.0, -1.0, 17.0, np.nan])
-def test_wrong_ranges_of_pictures_are_refused(bundle, name, value):
-    with pytest.raises(ValueError, match=f"{name}: expected "):
-        pictures_of(bundle, ranges=RANGES | {name: value})
 
 
 def test_a_picture_follows_from_its_number(bundle):
@@ -661,7 +636,7 @@ def test_the_core_refuses_what_does_not_fit(bundle, device):
 
 
 def test_pictures_are_refused_of_nothing(bundle):
-    given = {"table": residency.table(bundle), "cameras": [], "seed": 0, **RANGES}
+    given = {"table": residency.table(bundle), "cameras": [], "seed": 0}
     nothing = bundle.gaussians.subset(slice(0, 0))
     with pytest.raises(ValueError, match="asset: expected at least one gaussian, got none"):
         _core.CutPictures(asset=nothing.rows, **given)
@@ -669,7 +644,7 @@ def test_pictures_are_refused_of_nothing(bundle):
 
 @pytest.mark.gpu
 def test_pictures_are_refused_of_an_asset_elsewhere(bundle):
-    given = {"table": residency.table(bundle), "cameras": [], "seed": 0, **RANGES}
+    given = {"table": residency.table(bundle), "cameras": [], "seed": 0}
     with pytest.raises(
         ValueError, match="asset: expected gaussians on the host, got gaussians on a device"
     ):

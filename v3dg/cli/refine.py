@@ -53,7 +53,8 @@ class Refine(CameraFile, _common.OnDevice):
     on the free space that the asset surrounds."""
     drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
     """Fraction of a level's visibility that may be lost by dropping its least visible
-    gaussians. 0 keeps all gaussians."""
+    gaussians. 0 keeps all gaussians. Assets of faint gaussians, such as smoke, always
+    keep all."""
     seed: int = 0
     """Seed of random numbers. The same seed gives the same file, byte for byte, on the
     same kind of device and for any number of threads."""

@@ -82,7 +82,7 @@ def build_bundle(
         codec: The codec of the bundle, see `v3dg.Bundle`. With a lossy codec, levels
             are fitted to the rounded gaussians of the levels below them.
         quality: "draft" leaves the levels as they are built. "standard" then refines
-            them together (`v3dg.refine_bundle`). For each unit, it uses 26,000 pictures
+            them together (`v3dg.refine_bundle`). For each unit, it uses 18,000 pictures
             and one more for every 100 gaussians, which takes seconds on a GPU and
             minutes on a CPU. "best" uses five times as many pictures. docs/levels.md
             has the time and the gain of each. None means "standard" on a GPU, and

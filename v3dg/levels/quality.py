@@ -19,7 +19,7 @@ Quality = Literal["draft", "standard", "best"]
 
 # Number of pictures of a "standard" refinement: this minimum, plus one for every 100
 # gaussians. A large asset needs more pictures, because each shows a smaller part of it.
-_LEAST_PICTURES = 26_000
+_LEAST_PICTURES = 18_000
 _GAUSSIANS_PER_PICTURE = 100
 # "best" uses this many times as many pictures as "standard".
 _BEST = 5

@@ -2,7 +2,6 @@
 of the asset. In a cut, gaussians of different groups hide each other, which fits of
 single groups cannot show."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +20,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.rows import in_runs
+from v3dg.levels.smooth import is_faint
 from v3dg.levels.viewpoints import SeenFrom
 from v3dg.residency import residency
 
@@ -28,9 +28,6 @@ _T = TypeVar("_T", covariant=True)
 # Step sizes of a refinement, as a fraction of those of a fit. The fraction is small,
 # because a refinement starts from fitted levels.
 _RATE = 0.2
-# The last pictures of a refinement, this fraction of them, show only coarse cuts, which
-# are in few of the others.
-_COARSE_PICTURES = 0.3
 # Default fraction of a level's visibility that may be lost by dropping its least
 # visible gaussians.
 DROP = 0.02
@@ -64,14 +61,7 @@ class RefineRequest:
         if self.drop > 0:
             num_weighing = _NUM_WEIGHING_PICTURES
         windows = default_steps(device).windows
-        num_steps = sum(-(-count // windows) for count in self.phases())
-        return num_weighing, num_steps * windows
-
-    def phases(self) -> tuple[int, int]:
-        """Return the number of pictures of all cuts, and the number of pictures of
-        coarse cuts, which follow them."""
-        num_coarse = math.floor(_COARSE_PICTURES * self.steps)
-        return self.steps - num_coarse, num_coarse
+        return num_weighing, -(-self.steps // windows) * windows
 
     def record(self) -> JsonObject:
         """Return the entries for this request in the config of a refined bundle."""
@@ -106,13 +96,13 @@ def with_refined_levels(
             bundle, cameras, request.drop, request.seed, device, progress, first_level=first_level
         )
     cuts = Cuts(bundle, cameras, request.seed, device, progress)
-    phases = zip(request.phases(), (default_steps(device), coarse_steps(device)), strict=True)
-    for num_pictures, steps in phases:
-        if num_pictures == 0:
-            break
-        moved = cuts.refined(
-            num_pictures, steps, text, first_level=first_level, target_px2=target_px2
-        )
+    moved = cuts.refined(
+        request.steps,
+        default_steps(device),
+        text,
+        first_level=first_level,
+        target_px2=target_px2,
+    )
     refined = in_runs(moved, bundle.clusters.offset)
     clusters = bundle.clusters.around(refined)
     return Bundle(clusters, bundle.groups, refined, bundle.config, bundle.codec)
@@ -129,11 +119,13 @@ def without_unseen(
     first_level: int = 1,
 ) -> Bundle:
     """Return the bundle without the least visible gaussians of each level, beginning
-    with level `first_level`.
+    with level `first_level`. A faint asset keeps all: none of its gaussians is hidden.
 
     `drop` is the fraction of a level's visibility that may be lost. Visibility is
     measured in pictures of cuts.
     """
+    if is_faint(bundle.level_gaussians(0)):
+        return bundle
     cuts = Cuts(bundle, cameras, seed, device, progress)
     weights, looks = cuts.weights(_NUM_WEIGHING_PICTURES)
     known_weights = np.where(looks < _LEAST_LOOKS, np.nan, weights)
@@ -154,19 +146,12 @@ class RefineSteps:
             that show the gaussian.
         window_means: Weight of the difference between the mean of a window and the mean
             of the asset in it, relative to the differences of pixels.
-        most_of_asset: Largest number of gaussians in a cut, as a fraction of the
-            asset's, above 0 and at most 1.
-        octaves: Range of the sizes of pictures, 0 to 16: the base-2 logarithm of the
-            largest size over the smallest, which is 0.18 times the native size of the
-            cut.
     """
 
     windows: int
     cuts_per_view: int = 8
     rate: float = _RATE
     window_means: float = 1.0
-    most_of_asset: float = 0.7
-    octaves: float = 5.75  # up to 9.7 times the native size
 
 
 def default_steps(device: Device) -> RefineSteps:
@@ -175,12 +160,6 @@ def default_steps(device: Device) -> RefineSteps:
     if device.is_cuda:
         return RefineSteps(windows=16, cuts_per_view=4)
     return RefineSteps(windows=1)
-
-
-def coarse_steps(device: Device) -> RefineSteps:
-    """Return the steps for pictures of coarse cuts, up to 16 times as large as their
-    native size."""
-    return replace(default_steps(device), rate=0.3, most_of_asset=0.08, octaves=6.5)
 
 
 class _CutOperation(Protocol[_T]):
@@ -214,17 +193,11 @@ class Cuts:
         everything = bundle.gaussians
         self._leaves = bundle.level_rows(0)
         self._gaussians = _device.place(everything.subset(np.arange(len(everything))), device)
-        self._asset = everything.subset(self._leaves)
-        self._cameras = [camera.core for camera in cameras]
-
-    def _pictures_of(self, steps: RefineSteps) -> _core.CutPictures:
-        return _core.CutPictures(
-            table=residency.table(self._bundle),
-            asset=self._asset.rows,
-            cameras=self._cameras,
-            seed=self._seed,
-            most_of_asset=steps.most_of_asset,
-            octaves=steps.octaves,
+        self._pictures = _core.CutPictures(
+            table=residency.table(bundle),
+            asset=everything.subset(self._leaves).rows,
+            cameras=[camera.core for camera in cameras],
+            seed=seed,
         )
 
     def refined(
@@ -259,14 +232,14 @@ class Cuts:
             target=target,
             radius=radius,
         )
-        self._run("refine", num_steps * settings.windows, move, settings, text)
+        self._run("refine", num_steps * settings.windows, move, text)
         return self._gaussians.numpy()
 
     def weights(self, num_pictures: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
         """Return how visible each gaussian is in some pictures, and how many of their
         cuts contain it."""
         weigh = partial(_core.weigh_cuts, config=self._config(num_pictures, _RATE))
-        return self._run("weigh", num_pictures, weigh, default_steps(self._device))
+        return self._run("weigh", num_pictures, weigh)
 
     def _config(self, num_steps: int, rate: float) -> _core.FitConfig:
         filter_px2 = float(self._bundle.clusters.filter_px2[self._bundle.level_range(1).start])
@@ -283,15 +256,9 @@ class Cuts:
         return fit_config(config, self._seed, 1)
 
     def _run(
-        self,
-        name: str,
-        num_pictures: int,
-        operation: _CutOperation[_T],
-        steps: RefineSteps,
-        text: str = "",
+        self, name: str, num_pictures: int, operation: _CutOperation[_T], text: str = ""
     ) -> _T:
-        pictures = self._pictures_of(steps)
-        work = partial(operation, gaussians=self._gaussians.rows, pictures=pictures)
+        work = partial(operation, gaussians=self._gaussians.rows, pictures=self._pictures)
         with Bar(num_pictures, name, self._progress) as bar:
 
             def show(state: _core.FitProgress) -> None:

@@ -49,7 +49,7 @@ def measured_config(
     first_leaves = level_1.leaf_offset[stride // 2 : -1 : stride].tolist()
     parts = [_device.place(leaves.read(first, first + size), device) for first in first_leaves]
     sample = Gaussians.concatenate(parts)
-    if _is_faint(sample):
+    if is_faint(sample):
         return replace(config, filter_px2=0.0)
     # The sample consists of the groups that were read. Each is divided into two
     # clusters, whatever the group size of the build.
@@ -73,7 +73,7 @@ def measured_config(
     return config
 
 
-def _is_faint(gaussians: Gaussians) -> bool:
+def is_faint(gaussians: Gaussians) -> bool:
     """Return whether most of the area belongs to faint gaussians.
 
     The area is weighted by opacity.

@@ -114,10 +114,16 @@ def drafts(faint_cloud, dark_ball):
 
 
 def test_refined_cuts_keep_alpha_and_colour(drafts, device):
-    pictures = max(4_000, 1_000 * refined.default_steps(_device.resolve(device)).windows)
+    pictures = 1_000 * refined.default_steps(_device.resolve(device)).windows
     for asset, bundle in drafts:
         moved = v3dg.refine_bundle(bundle, steps=pictures, device=device, progress=False)
         np.testing.assert_allclose(ratios(asset, moved, 14, device), 1, atol=0.025)
+
+
+def test_a_faint_asset_loses_no_gaussians(drafts):
+    for (_, bundle), is_faint in zip(drafts, (True, False), strict=True):
+        moved = v3dg.refine_bundle(bundle, steps=1, drop=0.1, device="cpu", progress=False)
+        assert (moved.num_gaussians == bundle.num_gaussians) == is_faint
 
 
 @pytest.mark.slow
