@@ -404,10 +404,6 @@ def _picture(
     import torch
 
     if depth is None:
-        # On a GPU, the backward pass reads the picture again, and programs may change
-        # the pictures of gsplat in place.
-        if color.is_cuda and color.requires_grad:
-            return color.clone()
         return color
     if look.depth == "D":
         depth = depth * alpha
