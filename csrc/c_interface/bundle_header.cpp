@@ -181,9 +181,9 @@ class HeaderReader {
         check_entry(root, table.name, table.dtype, table.value_bytes, shape);
     }
 
-    // Fails unless the header's entry of a tensor is the expected one, which follows from
-    // its type and shape and from the tensors before it. Records where the tensor is, so
-    // tensors must be checked in the order of the file.
+    // Fails unless the header's entry of a tensor is the expected one, which follows
+    // from its type and shape and from the tensors before it. Records where the tensor
+    // is, so tensors must be checked in the order of the file.
     void check_entry(const Json& root, const std::string& name, const std::string& dtype,
                      uint64_t value_bytes, const std::vector<uint64_t>& shape) {
         uint64_t size = value_bytes;
@@ -229,7 +229,7 @@ class HeaderReader {
             if (out_.parts.count(member.key) == 0 && member.key != "__metadata__")
                 unknown.insert(member.key);
         if (unknown.empty()) return;
-        fail(in_quotes(*unknown.begin()) + ": expected only tensors of version " +
+        fail(in_quotes(*unknown.begin()) + ": expected only tensors of format version " +
              std::to_string(out_.version) + ", got another one");
     }
 

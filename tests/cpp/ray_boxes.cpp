@@ -44,10 +44,25 @@ struct Extent {
     double turn = 0, height = 0;  // of the directions of the points, at most
 };
 
-// Whether a point of the ellipsoid is in the box and not nearer than the bound.
-bool contains(const DirectionBox<float>& box, float nearest, const double p[3], Extent& extent) {
-    const double distance = sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
-    if (distance < nearest) return false;
+// The distance at which the ray through a point is hit, where the gaussian's value along
+// the ray is largest.
+double hit_distance(const SeenGaussian<float>& seen, const double p[3]) {
+    const double length = sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
+    double along_mean = 0, along_ray = 0;
+    for (int a = 0; a < 3; ++a) {
+        double mean = 0, ray = 0;
+        for (int i = 0; i < 3; ++i) {
+            mean += double(seen.axis[a][i]) * seen.direction[i];
+            ray += double(seen.axis[a][i]) * p[i] / length;
+        }
+        along_mean += mean * ray / (double(seen.sigma[a]) * seen.sigma[a]);
+        along_ray += ray * ray / (double(seen.sigma[a]) * seen.sigma[a]);
+    }
+    return seen.distance * along_mean / along_ray;
+}
+
+// Whether a point of the ellipsoid is in the box.
+bool contains(const DirectionBox<float>& box, const double p[3], Extent& extent) {
     const double middle = 0.5 * (double(box.azimuth0) + box.azimuth1);
     const double turn = std::remainder(atan2(p[1], p[0]) - middle, 2 * kPi);
     const double elevation = atan2(p[2], sqrt(p[0] * p[0] + p[1] * p[1]));
@@ -85,7 +100,9 @@ int main() {
                 for (int a = 0; a < 3; ++a) p[i] += scale * w[a] * seen.sigma[a] * seen.axis[a][i];
                 p[i] *= seen.distance;
             }
-            is_missed = is_missed || !contains(box, nearest, p, extent);
+            const double hit = hit_distance(seen, p);
+            const bool is_in_front = hit > 0 && hit < nearest * (1 - 1e-6);
+            is_missed = is_missed || is_in_front || !contains(box, p, extent);
         }
         missed += is_missed;
         const double height = double(box.elevation1) - box.elevation0;

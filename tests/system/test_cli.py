@@ -470,7 +470,13 @@ def test_wrong_usage(folder):
         cwd=folder,
     )
     fails(
-        2, "--size: expected 2 values, got fewer;", "render", "tuft.v3dg", "--size", 100, cwd=folder
+        2,
+        "--size: expected 2 whole numbers, got '100';",
+        "render",
+        "tuft.v3dg",
+        "--size",
+        100,
+        cwd=folder,
     )
     fails(2, "--output: expected 1 value, got fewer;", "render", "tuft.v3dg", "-o", cwd=folder)
     fails(
