@@ -166,8 +166,9 @@ def render(
     shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
     look = _Look(cut_request, shade, cut, channels, chosen_device)
     chosen_frame = frame.chosen(opened_subject)
-    has_no_elements = getattr(camera, "ndim", 1) == 0
-    if isinstance(camera, Iterable) and not has_no_elements:
+    if getattr(camera, "ndim", None) == 0:  # such an array is Iterable, but has no elements
+        check_camera(camera)
+    if isinstance(camera, Iterable):
         return _draw_several(chosen_frame, opened_subject, list(camera), mesh, look)
     check_camera(camera)
     return chosen_frame.draw_settled(opened_subject, look.picture(camera, mesh))
