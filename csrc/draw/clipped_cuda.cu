@@ -89,15 +89,6 @@ __device__ bool may_clip(const float4& sphere, const ModelView<float>& view, flo
     return p[2] < near_depth && !(p[2] + reach < near_depth - (kMargin - 1) * near_depth);
 }
 
-__device__ Gaussian3d<float> gaussian_of(const GaussianRows<const float>& rows, size_t g) {
-    Gaussian3d<float> gaussian;
-    for (int k = 0; k < 3; ++k) gaussian.mean[k] = rows.means[3 * g + k];
-    for (int k = 0; k < 4; ++k) gaussian.quat[k] = rows.quats[4 * g + k];
-    for (int k = 0; k < 3; ++k) gaussian.scale[k] = rows.scales[3 * g + k];
-    gaussian.opacity = rows.opacities[g];
-    return gaussian;
-}
-
 __device__ bool body_of_gaussian(const Gaussian3d<float>& g, const ModelView<float>& view,
                                  float weight, float near_depth, ClippedBody& body) {
     float p[3];
@@ -142,7 +133,7 @@ __device__ bool body_of(const DrawnModels& models, const ClippedRun& run, uint32
     if (has_packed && !may_clip(PackedSource::fetch(models.packed[run.model], g), view, near_depth))
         return false;
     if (models.rows != nullptr && models.rows[run.model].quats != nullptr)
-        return body_of_gaussian(gaussian_of(models.rows[run.model], g), view, run.weight,
+        return body_of_gaussian(gaussian_in_row(models.rows[run.model], g), view, run.weight,
                                 near_depth, body);
     return body_of_packed(models.packed[run.model], g, view, run.weight, near_depth, body);
 }

@@ -52,6 +52,17 @@ struct GaussianRows {
     }
 };
 
+// Returns the gaussian in row `row`, without SH coefficients.
+template <class T>
+V3DG_HD inline Gaussian3d<T> gaussian_in_row(const GaussianRows<const T>& rows, size_t row) {
+    Gaussian3d<T> g;
+    for (int k = 0; k < 3; ++k) g.mean[k] = rows.means[3 * row + k];
+    for (int k = 0; k < 4; ++k) g.quat[k] = rows.quats[4 * row + k];
+    for (int k = 0; k < 3; ++k) g.scale[k] = rows.scales[3 * row + k];
+    g.opacity = rows.opacities[row];
+    return g;
+}
+
 // Copies row `from` of `source` to row `to`, without SH coefficients.
 template <class T>
 V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,

@@ -40,11 +40,7 @@ struct EllipsesInput {
   private:
     template <ProjectingModel C>
     V3DG_HD void write_by(const C& model, size_t i, const Ellipses<T>& out) const {
-        Gaussian3d<T> g;
-        for (int k = 0; k < 3; ++k) g.mean[k] = rows.means[3 * i + k];
-        for (int k = 0; k < 4; ++k) g.quat[k] = rows.quats[4 * i + k];
-        for (int k = 0; k < 3; ++k) g.scale[k] = rows.scales[3 * i + k];
-        g.opacity = rows.opacities[i];
+        const Gaussian3d<T> g = gaussian_in_row(rows, i);
         Projection<T, C> s;
         to_view(view, g.mean, s.p);
         const Ellipse<T> e = project_gaussian(g, view, model, filter_px2, antialiased, s);

@@ -23,19 +23,10 @@ __device__ void pack_row(const Gaussian3d<float>& gaussian, const float* sh, flo
     planes[3 * num_rows + row] = {p.log2_opacity, color[0], color[1], color[2]};
 }
 
-__device__ Gaussian3d<float> gaussian_of(const GaussianRows<const float>& rows, size_t g) {
-    Gaussian3d<float> gaussian;
-    for (int k = 0; k < 3; ++k) gaussian.mean[k] = rows.means[3 * g + k];
-    for (int k = 0; k < 4; ++k) gaussian.quat[k] = rows.quats[4 * g + k];
-    for (int k = 0; k < 3; ++k) gaussian.scale[k] = rows.scales[3 * g + k];
-    gaussian.opacity = rows.opacities[g];
-    return gaussian;
-}
-
 __global__ void pack_kernel(GaussianRows<const float> rows, float4* planes) {
     const size_t g = blockIdx.x * size_t(blockDim.x) + threadIdx.x;
     if (g < rows.size)
-        pack_row(gaussian_of(rows, g), rows.sh + g * rows.num_sh(), planes, rows.size, g);
+        pack_row(gaussian_in_row(rows, g), rows.sh + g * rows.num_sh(), planes, rows.size, g);
 }
 
 // Decodes a row of a coded page. `sh` must have room for all SH coefficients.
@@ -63,7 +54,8 @@ __global__ void pack_pages_kernel(const PageRows* pages, float4* planes, size_t 
     for (size_t g = threadIdx.x; g < page.rows.size; g += blockDim.x) {
         const size_t row = page.first_row + g;
         if (page.codes.words == nullptr) {
-            pack_row(gaussian_of(page.rows, g), page.rows.sh + g * num_sh, planes, num_rows, row);
+            pack_row(gaussian_in_row(page.rows, g), page.rows.sh + g * num_sh, planes, num_rows,
+                     row);
             continue;
         }
         float own_sh[3 * kMaxShBases];
