@@ -8,7 +8,7 @@
 
 #include <v3dg.h>
 #include "c_interface/bundle.h"
-#include "residency/instance_table.h"
+#include "residency/instance_columns.h"
 
 namespace v3dg {
 
@@ -27,19 +27,8 @@ struct SceneContent {
     std::string up;  // the axis that points up, or empty
 };
 
-// The instances of a scene in the form that the core reads.
-class InstanceColumns {
-  public:
-    InstanceColumns() = default;
-    explicit InstanceColumns(const std::vector<v3dg_instance>& instances);
-    InstanceTable table() const;
-
-  private:
-    std::vector<int32_t> bundle_;
-    std::vector<double> position_, quaternion_, scale_;
-    std::vector<float> importance_;
-    std::vector<InstanceFactors> factors_;  // empty if all are 1
-};
+// Returns the instances of a scene in the form that the core reads.
+InstanceColumns columns_of(const std::vector<v3dg_instance>& instances);
 
 }  // namespace v3dg
 

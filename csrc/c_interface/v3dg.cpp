@@ -86,7 +86,7 @@ uint64_t new_revision() {
 
 // Checks the instances, and replaces those of the scene.
 void publish(v3dg_scene& scene, std::vector<v3dg_instance> instances) {
-    InstanceColumns columns(instances);
+    InstanceColumns columns = columns_of(instances);
     scene.content.instances = std::move(instances);
     scene.columns = std::move(columns);
     scene.revision = new_revision();

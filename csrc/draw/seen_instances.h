@@ -6,6 +6,7 @@
 
 #include "draw/scene_frame.h"
 #include "residency/environments.h"
+#include "residency/instance_columns.h"
 
 namespace v3dg {
 
@@ -18,23 +19,15 @@ class SeenInstances {
         for (int32_t slot = 0; slot < count; ++slot) {
             const auto i = static_cast<size_t>(environments.instance_of(environment, slot));
             ids_.push_back(static_cast<int32_t>(i));
-            bundle_.push_back(all.bundle[i]);
-            position_.insert(position_.end(), &all.position[3 * i], &all.position[3 * i] + 3);
-            quaternion_.insert(quaternion_.end(), &all.quaternion[4 * i],
-                               &all.quaternion[4 * i] + 4);
-            scale_.push_back(all.scale[i]);
-            importance_.push_back(all.importance[i]);
-            if (!all.factors.empty()) factors_.push_back(all.factors[i]);
+            columns_.bundle.push_back(all.bundle[i]);
+            append(columns_.position, &all.position[3 * i], 3);
+            append(columns_.quaternion, &all.quaternion[4 * i], 4);
+            columns_.scale.push_back(all.scale[i]);
+            columns_.importance.push_back(all.importance[i]);
+            if (!all.factors.empty()) columns_.factors.push_back(all.factors[i]);
         }
     }
-    InstanceTable table() const {
-        return {.bundle = {bundle_.data(), bundle_.size()},
-                .position = {position_.data(), position_.size()},
-                .quaternion = {quaternion_.data(), quaternion_.size()},
-                .scale = {scale_.data(), scale_.size()},
-                .importance = {importance_.data(), importance_.size()},
-                .factors = {factors_.data(), factors_.size()}};
-    }
+    InstanceTable table() const { return columns_.table(); }
     // Returns the ids of the instances in the whole scene.
     Span<const int32_t> ids() const { return {ids_.data(), ids_.size()}; }
     // Returns the scene with only these instances. It refers to this object.
@@ -46,10 +39,12 @@ class SeenInstances {
     }
 
   private:
-    std::vector<int32_t> ids_, bundle_;
-    std::vector<double> position_, quaternion_, scale_;
-    std::vector<float> importance_;
-    std::vector<InstanceFactors> factors_;
+    static void append(std::vector<double>& column, const double* values, size_t count) {
+        column.insert(column.end(), values, values + count);
+    }
+
+    std::vector<int32_t> ids_;
+    InstanceColumns columns_;
 };
 
 }  // namespace v3dg
