@@ -254,11 +254,7 @@ def _poses_of(pose: _Poses, device: Device) -> tuple[Array, bool]:
     shape = tuple(tensor.shape)
     expected = f"shape (4, 4) or (B, 4, 4), got {shape}"
     check("pose", shape[-2:] == (4, 4) and len(shape) in (2, 3), expected)
-    expected = f"float32 or float64, got {tensor.dtype}"
-    check("pose", str(tensor.dtype) in ("torch.float32", "torch.float64"), expected)
-    of_tensor = _device.of(tensor)
-    expected = f"a tensor on {device}, which scans, got one on {of_tensor}"
-    check("pose", of_tensor == device and device != CPU, expected)
+    _check_tensor(tensor, "pose", ("float32", "float64"), device)
     return tensor.reshape(-1, 4, 4), len(shape) == 2
 
 
@@ -282,12 +278,18 @@ def _environments_of(
     tensor = cast("Array", environment).detach()
     expected = f"shape () or ({count},), got {tuple(tensor.shape)}"
     check("environment", tuple(tensor.shape) in ((), (count,)), expected)
-    expected = f"int32 or int64, got {tensor.dtype}"
-    check("environment", str(tensor.dtype) in ("torch.int32", "torch.int64"), expected)
+    _check_tensor(tensor, "environment", ("int32", "int64"), device)
+    return tensor.expand(count).contiguous()
+
+
+def _check_tensor(tensor: Array, name: str, dtypes: tuple[str, str], device: Device) -> None:
+    """Raise ValueError for a tensor of another dtype, or on another device than the one
+    that scans."""
+    fits = str(tensor.dtype).removeprefix("torch.") in dtypes
+    check(name, fits, f"{' or '.join(dtypes)}, got {tensor.dtype}")
     of_tensor = _device.of(tensor)
     expected = f"a tensor on {device}, which scans, got one on {of_tensor}"
-    check("environment", of_tensor == device and device != CPU, expected)
-    return tensor.expand(count).contiguous()
+    check(name, of_tensor == device and device != CPU, expected)
 
 
 def _check_environments(numbers: npt.NDArray[np.int32], subject: Subject) -> None:
