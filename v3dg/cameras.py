@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Literal, TypeAlias, TypeVar, cast, get_args
+from typing import Literal, TypeAlias, TypeGuard, TypeVar, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -329,9 +329,15 @@ def for_each(
 ) -> T | list[T]:
     """Return the result of ``make`` for one camera. For several cameras, return a list
     of the results."""
-    if hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0:
-        return [make(view) for view in cast(Iterable[Camera], camera)]
+    if are_several(camera):
+        return [make(view) for view in camera]
     return make(cast(Camera, camera))
+
+
+def are_several(camera: object) -> TypeGuard[Iterable[Camera]]:
+    """Return whether an argument is several cameras. An array without axes is not,
+    although it is iterable."""
+    return hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0
 
 
 def check_pinhole(name: str, camera: Camera, advice: str) -> None:

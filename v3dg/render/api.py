@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, cast, get_args, overload
@@ -12,7 +11,7 @@ from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import check, one_of, vector, whole
 from v3dg.camera_batch import CameraBatch
-from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera
+from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, are_several, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
@@ -166,12 +165,11 @@ def render(
     shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=with_depth)
     look = _Look(cut_request, shade, cut, channels, chosen_device)
     chosen_frame = frame.chosen(opened_subject)
-    if getattr(camera, "ndim", None) == 0:  # such an array is Iterable, but has no elements
-        check_camera(camera)
-    if isinstance(camera, Iterable):
+    if are_several(camera):
         return _draw_several(chosen_frame, opened_subject, list(camera), mesh, look)
     check_camera(camera)
-    return chosen_frame.draw_settled(opened_subject, look.picture(camera, mesh))
+    view = cast("Camera | StereoCamera", camera)
+    return chosen_frame.draw_settled(opened_subject, look.picture(view, mesh))
 
 
 @dataclass(frozen=True)
