@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from v3dg import _core
+from v3dg.rotations import rotation_from_quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -169,32 +170,14 @@ def _looks(
     return limited, look.astype(np.uint32)
 
 
-def eye_of(viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the position of a camera in the world."""
-    return -np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3]).astype(np.float64)
-
-
-def _rotations_of(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation matrices (N, 3, 3) of quaternions (w, x, y, z) of any length
-    but zero."""
-    w, x, y, z = quaternions.T
-    s = 2 / (w * w + x * x + y * y + z * z)
-    rows = [
-        [1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
-        [s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)],
-        [s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
 def placements_of(
     camera: Camera, scene: Scene, instances: NDArray[np.int32]
 ) -> NDArray[np.float32]:
     """Return (I, 24) the placements of instances in front of a camera."""
     viewmat = np.asarray(camera.viewmat, np.float64)
     scales = np.asarray(scene.scales, np.float64)[instances]
-    rotations = _rotations_of(np.asarray(scene.quaternions, np.float64)[instances])
-    from_origin = eye_of(viewmat) - np.asarray(scene.positions, np.float64)[instances]
+    rotations = rotation_from_quaternion(scene.quaternions[instances])
+    from_origin = camera.position - np.asarray(scene.positions, np.float64)[instances]
     eyes = np.einsum("nka,nk->na", rotations, from_origin) / scales[:, None]
     leading = eyes.astype(np.float32)
     linear = scales[:, None, None] * (viewmat[:3, :3] @ rotations)
