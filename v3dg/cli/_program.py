@@ -227,8 +227,8 @@ def _plainly(text: str) -> str:
         expected = "whole numbers"
         if "float" in match[2].lower():
             expected = "numbers"
-        if match[1] == "--size":
-            expected = "2 whole numbers"
+        if numbers := re.search(r"{(\w+(?: \w+)+)}", match[2]):
+            expected = f"{len(numbers[1].split())} {expected}"
         return f"{match[1]}: expected {expected}, got " + ", ".join(re.findall("'.*?'", match[2]))
     if match := re.match(r"Missing from [^:]*: (\S+) (.*?)\.? \(required\)", text):
         return f"{match[1]}: expected {match[2][:1].lower()}{match[2][1:]}, got nothing"
